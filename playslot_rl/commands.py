@@ -93,16 +93,19 @@ COMMANDS: Final[dict[str, Command]] = {
         "env.max_steps env.frame_skip env.blocks render collect.validation_episodes",
     ),
     "evaluate": Command(
-        "success rate in simulation (closed loop) or in imagination (open loop)",
+        "success in simulation (closed loop) or imagination (open loop), or the error of actions without a simulator",
         "Evaluates a fixed list of held-out seeds, one episode each, and writes "
-        "RUN/evaluation/PROTOCOL/eval_info.json. A run on GridShapes has no policy: its slot masks and latent actions "
-        "are scored against the known objects and moves.",
+        "RUN/evaluation/PROTOCOL/eval_info.json. protocol=actions holds the policy's actions against those of recorded "
+        "demonstrations that nothing was trained on: those held out by data.held_out=, or another set, data.demos=. A "
+        "run on GridShapes has no policy: its slot masks and latent actions are scored against the known objects and "
+        "moves.",
         (
             "playslot evaluate run=runs/mine protocol=simulation episodes=50",
             "playslot evaluate run=runs/mine protocol=imagination episodes=50 seed=3",
             "playslot evaluate run=runs/shapes episodes=100",
+            "playslot evaluate run=runs/arm protocol=actions data.demos=data/new",
         ),
-        f"run episodes seed protocol device threads {TASK} evaluation data.root data.demos",
+        f"run method episodes seed protocol device threads {TASK} evaluation data.root data.demos",
     ),
     "inspect": Command(
         "report card of a world model: are its slots and latent actions any good?",
@@ -181,7 +184,8 @@ COMMANDS: Final[dict[str, Command]] = {
         "carries on after a stop and tries what failed again. Here demos=, labels=, seeds= and methods= are lists; "
         "labels= makes it a table by labelled demonstrations, beside slot_bc and resnet_bc on these alone, and videos= "
         "one by unlabelled videos. envs= are tasks, each compared in OUT/TASK, and a table over all. worlds= are world "
-        "models, compare.block=test a fresh block of episodes. The world model is run=, or trained once into "
+        "models, compare.block=test a fresh block of episodes. With env=video the error of actions on the last "
+        "demonstrations is measured, for want of a simulator. The world model is run=, or trained once into "
         "OUT/world_model; data are data.root and data.demos, or recorded once into OUT/data. Jobs run one after the "
         "other, or by a Hydra launcher: hydra.launcher=joblib, submitit_local, "
         "submitit_slurm or ray, with its own keys as hydra.launcher.KEY=VALUE.",
@@ -190,6 +194,7 @@ COMMANDS: Final[dict[str, Command]] = {
             "playslot compare run=pretrained demos=150 labels=2,5,25 methods=playslot,lapo,slot_bc out=runs/labels",
             "playslot compare env=block_push_easy methods=playslot,slot_oracle demos=100,600 seeds=0 out=runs/blocks",
             "playslot compare envs=metaworld/drawer-open,block_push_easy demos=100 labels=5 out=runs/tasks",
+            "playslot compare env=video methods=resnet_bc,act labels=5,10 data.demos=data/arm out=runs/arm",
             "playslot compare run=pretrained hydra.launcher=joblib hydra.launcher.n_jobs=2 out=runs/comparison",
         ),
         f"env run episodes workers {TRAINED} compare {MADE} collector {STAGES} baselines evaluation",

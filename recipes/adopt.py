@@ -52,7 +52,8 @@ def main(config: ExperimentConfig) -> None:
     began = time.monotonic()
     run = run_to_write(config).folder
     seen = survey(config.data.root, config.data.camera)
-    least = shortest(config)
+    shown = max(1, len(seen.lengths) - config.data.held_out)
+    seen, least = replace(seen, lengths=seen.lengths[:shown]), shortest(config)
     if np.median(seen.lengths) < least:
         raise DataError(
             f"{seen.root}: got episodes of {np.median(seen.lengths):.0f} frames (median), expected at least {least} in "

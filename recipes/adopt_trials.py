@@ -114,7 +114,7 @@ def choose_prototypes(config: ExperimentConfig, run: Path, steps: int, milliseco
         train_dynamics.main(replace(trial, run=str(run), out=str(out)), paced(steps, milliseconds))
     trained = Run.open(out)
     model = trained.load_world_model(config.device or "cpu")
-    source = open_videos(config, config.data.root, "adopt")
+    source = open_videos(config, config.data.root, "adopt", False)
     slots = slot_cache(
         source, model.savi, trained.stage("slots").fingerprint, Cache.of(config.data), module_device(model), False
     )

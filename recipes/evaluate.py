@@ -11,7 +11,7 @@ from typing import Any
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, method_stage
-from playslot_rl.envs import PROCEDURAL
+from playslot_rl.envs import PROCEDURAL, RECORDED
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects
 from playslot_rl.runs import Run
@@ -30,6 +30,14 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
     if run.pretrained:
         run = run_of_pretrained(config, run)
         config = replace(config, run=str(run.folder), out="")
+    if config.protocol == "actions":
+        error_of_actions(config, run)
+        return
+    if config.env.name in RECORDED:
+        raise ConfigError(
+            f"protocol: got {config.protocol} with env={config.env.name}, which has no simulator, expected actions: "
+            "the error on demonstrations that nothing was trained on"
+        )
     if not METHODS[config.method].imagines:
         evaluate_baseline(config, run)
         return
@@ -69,6 +77,18 @@ def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
         print(describe(evaluate_actor(run.folder, actor, config, pool), run.folder), flush=True)
 
 
+def error_of_actions(config: ExperimentConfig, run: Run) -> None:
+    """Hold the policy's actions against held-out demonstrations, and print the result."""
+    from playslot_rl.evaluation.actions import evaluate_actions, require_offline
+    from playslot_rl.evaluation.success import run_facts
+
+    require_offline(config.method)
+    run_facts(run.folder, config.method)  # a run without a policy is refused before anything is loaded
+    require_task(config, run.own(method_stage(config.method)).group(EnvConfig, "env"))
+    result = evaluate_actions(run, config, open_device(config.device, config.threads))
+    print(describe_actions(result, run.folder), flush=True)
+
+
 def main_if_needed(config: ExperimentConfig) -> None:
     """Evaluate under both protocols and renew the report, leaving out what this policy was measured on before."""
     from playslot_rl.evaluation.success import POLICY_PROTOCOLS, run_facts
@@ -98,20 +118,22 @@ def once(config: ExperimentConfig) -> bool:
     """Evaluate under `config.protocol`, without a report, unless the same policy was measured so before; whether it was
     measured now.
     """
+    from playslot_rl.evaluation.actions import asked
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
 
     run, protocol = Run.of(config), config.protocol
-    facts = {
-        "episodes": config.episodes or DEFAULT_EPISODES,
-        "seed": config.seed,
-        "fingerprints": run_facts(run.folder, config.method).fingerprints,
-        **task_facts(config, config.seed),
-    }
+    facts: dict[str, Any] = {"fingerprints": run_facts(run.folder, config.method).fingerprints}
+    if protocol == "actions":
+        facts["asked"] = asked(config)
+    else:
+        facts |= {"episodes": config.episodes or DEFAULT_EPISODES, "seed": config.seed}
+        facts |= task_facts(config, config.seed)
+    said = scored if protocol == "actions" else rate
     stored = run.result(f"evaluation/{protocol}/eval_info.json", facts)
     if stored is None:
         main(config, report=False)
         return True
-    print(f"{protocol}: measured before, {rate(stored)}, skipped", flush=True)
+    print(f"{protocol}: measured before, {said(stored)}, skipped", flush=True)
     return False
 
 
@@ -150,3 +172,28 @@ def describe(result: dict[str, Any], run: Path) -> str:
     path = run / "evaluation" / result["protocol"] / "eval_info.json"
     took = result["wall_seconds_with_references"]
     return "\n".join([*lines, f"{result['episodes']} episodes each, {took:.0f} s; written to {path}"])
+
+
+def describe_actions(result: dict[str, Any], run: Path) -> str:
+    """The error of actions in a few lines: the policy, what to hold it against, and each dimension."""
+    references = result["references"]
+    rows = [(METHODS[result["method"]].title, result)]
+    rows += [("constant mean action", references["constant"]), ("previous action again", references["previous"])]
+    lines = [f"{name:>22}: {scored(row)}" for name, row in rows]
+    for row in result["per_dimension"]:
+        lines.append(f"{row['name']:>22}: error {row['mae']:.3g}, of the constant {row['constant_mae']:.3g}")
+    if result["untold"]:
+        lines.append(f"note: {', '.join(result['untold'])}: of an earlier version, does not say what it was trained on")
+    path = run / "evaluation" / "actions" / "eval_info.json"
+    counted = f"{result['episodes']} held-out episodes, {result['rows']:,} actions of {result['data']['name']}"
+    return "\n".join([*lines, f"{counted}, {result['wall_seconds']:.0f} s; written to {path}"])
+
+
+def scored(row: dict[str, Any]) -> str:
+    """Mean absolute error in the data set's units and R2, with their intervals: `error 4.2 (3.9 to 4.6), R2 0.71`."""
+    parts = []
+    for name, word, form in (("mae", "error", ".3g"), ("r2", "R2", ".2f")):
+        if row[name] is not None:
+            ends = row["ci95"][name]
+            parts.append(f"{word} {row[name]:{form}}" + (f" ({ends[0]:{form}} to {ends[1]:{form}})" if ends else ""))
+    return ", ".join(parts)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.methods import METHODS, require_told
-from playslot_rl.envs import gym_id
+from playslot_rl.envs import RECORDED, gym_id
 from playslot_rl.errors import ConfigError
 
 
@@ -24,7 +24,13 @@ def main(config: ExperimentConfig) -> None:
             f"run: got nothing with method={config.method}, expected the world model whose slots it builds on: "
             "a run folder, or run=pretrained"
         )
-    if method.acts:
+    if config.env.name in RECORDED and method.online:
+        able = ", ".join(name for name, one in METHODS.items() if one.acts and not one.online)
+        raise ConfigError(
+            f"method: got {method.name}, which learns by acting, with env={config.env.name}, which has no simulator, "
+            f"expected one that learns from demonstrations: {able}"
+        )
+    if method.acts and config.env.name not in RECORDED:
         gym_id(config.env.name)
     require_told(config.env, method.name)
     from playslot_rl.methods.training import train

@@ -37,6 +37,11 @@ CONF_MODULE: Final = "playslot_rl.recipes.conf"
 GROUPS: Final = ("env", "preset")
 CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "train-dynamics", "train-policy"})
 """Commands that take the config of the run they continue."""
+VIEWS: Final = frozenset({"train-baseline", "compare"})
+"""Commands that with `env=video` read a set as the run that they build on, unless something else is typed."""
+VIEWED: Final = (
+    "preset", "env.image_size", "data.camera", "data.stride", "data.stride_action", "data.resize", "data.held_out",
+)  # fmt: skip
 COMPARISONS: Final = {
     "compare": ("envs", "methods", "demos", "labels", "videos", "worlds", "seeds", "processes"),
     "compare-video": ("methods", "seeds", "vary", "values", "objects", "processes"),
@@ -94,6 +99,8 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         if is_pretrained(run) and run != PRETRAINED:
             pairs.setdefault("env", run.partition("/")[2])  # the task that the model is named after
             _check_choice("env", pairs["env"])
+        if run and not is_pretrained(run) and command in VIEWS and pairs.get("env") == "video":
+            pairs = {**_views(Path(run)), **pairs}
         if continues:
             config = _from_run(Path(run), pairs, command == "play")
         else:
@@ -331,6 +338,13 @@ def _from_run(run: Path, pairs: Mapping[str, str], play: bool) -> ExperimentConf
     values.update({key: defaults[key] for key in keys_of(ExperimentConfig, "call")})
     config = from_dict(ExperimentConfig, merged(values, _typed(pairs)))
     return config if config.out else dataclasses.replace(config, out=str(run))
+
+
+def _views(run: Path) -> dict[str, str]:
+    """How a run of recorded videos read them, as it would be typed; nothing of another task."""
+    stored = stored_config(run)
+    known = flatten(to_dict(stored)) if stored.env.name == "video" else {}
+    return {key: _text(known[key]) for key in VIEWED if key in known}
 
 
 def stored_config(run: Path, exported: bool = False) -> ExperimentConfig:

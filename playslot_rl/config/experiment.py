@@ -243,7 +243,7 @@ class ExperimentConfig(Checked):
         out: folder to write.
         run: run folder to read (and to write where `out` is empty); `pretrained` names the task's own model.
         protocol: evaluation protocol: a policy in `simulation` or `imagination`, its decoder in a `replay` of the
-            expert's videos, or the `slots` it builds on.
+            expert's videos, the `slots` it builds on, or its `actions` beside those of held-out demonstrations.
         device: torch device; empty means a GPU if there is one.
         threads: torch threads; 0 leaves torch's choice.
         method: what `train-baseline` trains (a name of `playslot_rl.config.methods`).
@@ -259,7 +259,7 @@ class ExperimentConfig(Checked):
     workers: int = field(default=0, metadata=role("call", "machine") | WORKERS)
     out: str = field(default="", metadata=role("call", "machine", "folder"))
     run: str = field(default="", metadata=role("call", "machine", "folder"))
-    protocol: Literal["simulation", "imagination", "replay", "slots"] = field(
+    protocol: Literal["simulation", "imagination", "replay", "slots", "actions"] = field(
         default="simulation", metadata=role("call")
     )
     device: str = field(default="", metadata=role("call", "machine"))

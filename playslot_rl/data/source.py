@@ -71,6 +71,8 @@ class EpisodeFrames:
         recorded: which recorded episode each is a view of, 0 to R - 1, int64 (E,); None where each is one of its own.
         limits: what actions in [-1, 1] stand for; None for those of our simulators, which are so, and without actions.
         states: proprioception, float32 (F, S), or None.
+        origins: of each episode a hash of its actions, or where they say nothing of its set and its number, str (E,):
+            the same in any set that it is copied to, and however it is viewed.
     """
 
     frames: FrameRows
@@ -91,6 +93,7 @@ class EpisodeFrames:
     tasks: npt.NDArray[np.str_] | None = None
     recorded: npt.NDArray[np.int64] | None = None
     unlabelled: str = ""
+    origins: npt.NDArray[np.str_] | None = None
 
     @property
     def episodes(self) -> int:
@@ -200,6 +203,7 @@ def open_sources(
                     robot=str(files.info.get("robot_type") or ""),
                     name=str(root),
                     limits=limits,
+                    origins=_origins(labels, fingerprint),
                     **labels,
                 )
             )
@@ -285,6 +289,16 @@ def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     fingerprint = files.file_hash(camera)
     write_json(note, {"fingerprint": fingerprint})
     return fingerprint
+
+
+def _origins(labels: dict[str, Any], fingerprint: str) -> npt.NDArray[np.str_]:
+    def one(number: int, start: int, length: int) -> str:
+        known = np.zeros((1, 0)) if labels["actions"] is None else labels["actions"][start : start + length]
+        alike = bool((known == known[0]).all())  # which says nothing, as of unlabelled ones
+        return hashlib.sha256(f"{fingerprint}/{number}".encode() if alike else known.tobytes()).hexdigest()[:12]
+
+    spans = zip(labels["starts"], labels["lengths"], strict=True)
+    return np.array([one(number, *span) for number, span in enumerate(spans)], np.str_)
 
 
 def labels_of(files: Contents) -> dict[str, Any]:

@@ -144,7 +144,7 @@ def _viewed(source: EpisodeFrames, how: str, **changes: Any) -> EpisodeFrames:
     return replace(source, fingerprint=text_hash(f"{source.fingerprint}/{how}"), **changes)
 
 
-def _chosen(source: EpisodeFrames, numbers: IntArray, how: str) -> EpisodeFrames:
+def chosen_episodes(source: EpisodeFrames, numbers: IntArray, how: str) -> EpisodeFrames:
     """Some recorded episodes, in an order: with all their views, which keep theirs. Row numbers stay, so that the slot
     cache of the whole serves any choice."""
     episodes, recorded = numbers, None
@@ -153,7 +153,7 @@ def _chosen(source: EpisodeFrames, numbers: IntArray, how: str) -> EpisodeFrames
         place[numbers] = np.arange(len(numbers))
         episodes = np.flatnonzero(place[source.recorded] >= 0)
         recorded = place[source.recorded[episodes]]
-    known = {name: getattr(source, name) for name in ("starts", "lengths", "seeds", "tasks")}
+    known = {name: getattr(source, name) for name in ("starts", "lengths", "seeds", "tasks", "origins")}
     chosen = {name: None if values is None else values[episodes] for name, values in known.items()}
     return _viewed(source, how, **chosen, recorded=recorded)
 
@@ -225,6 +225,7 @@ def concatenate(sources: Sequence[EpisodeFrames], weights: bool = False) -> Epis
         success=joined("success"),
         seeds=joined("seeds"),
         tasks=joined("tasks"),
+        origins=joined("origins"),
         recorded=None if all(s.recorded is None for s in sources) else np.concatenate(recorded),
         fingerprint=text_hash("+".join(source.fingerprint for source in sources)),
         name=",".join(dict.fromkeys(source.name for source in sources)),
@@ -288,7 +289,7 @@ def _led_actions(source: EpisodeFrames, stride: int, only_last: bool) -> npt.NDA
 
 def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames:
     """Recorded episodes `first` to `last` (exclusive) as a data set of their own, rows counted anew."""
-    chosen = _chosen(source, np.arange(first, last), f"episodes {first} {last}")
+    chosen = chosen_episodes(source, np.arange(first, last), f"episodes {first} {last}")
     rows = np.arange(chosen.starts[0], chosen.starts[-1] + chosen.lengths[-1])
     if source.recorded is not None:  # what lies between is of other episodes
         rows = np.concatenate([chosen.episode_rows(episode) for episode in range(chosen.episodes)])
@@ -315,7 +316,7 @@ def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFra
             f"demos: got {demos}, expected at most the {source.recordings} demonstrations there are: "
             "lower it or collect more"
         )
-    return _chosen(source, np.arange(demos), f"first {demos}")
+    return chosen_episodes(source, np.arange(demos), f"first {demos}")
 
 
 def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = None) -> EpisodeFrames:
@@ -323,7 +324,7 @@ def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = N
     first = first_demonstrations(source, among)
     order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.recordings)
     how = f"drawn {seed}"
-    drawn = _chosen(source, np.concatenate((order, np.arange(first.recordings, source.recordings))), how)
+    drawn = chosen_episodes(source, np.concatenate((order, np.arange(first.recordings, source.recordings))), how)
     return replace(drawn, fingerprint=text_hash(f"{first.fingerprint}/{how}"))
 
 
@@ -341,6 +342,6 @@ def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames,
         )
     order = np.random.default_rng(TEST_STREAM).permutation(source.recordings)
     return (
-        _chosen(source, np.sort(order[kept:]), f"trained {kept}"),
-        _chosen(source, np.sort(order[:kept]), f"tested {kept}"),
+        chosen_episodes(source, np.sort(order[kept:]), f"trained {kept}"),
+        chosen_episodes(source, np.sort(order[:kept]), f"tested {kept}"),
     )

@@ -97,7 +97,9 @@ def _candidates(
         )
         return chosen, f"the last {last} episodes, which are held out from {why}", unseen
     if len(chosen := usable[numbers >= source.recordings - config.held_out]):
-        return chosen, f"the last {config.held_out} episodes, as data.held_out says", False
+        mine = set() if source.origins is None else set(source.origins[chosen].tolist())
+        unseen = bool(world and mine) and all("trained_on" in m and not mine & {*m["trained_on"]} for m in world)
+        return chosen, f"the last {config.held_out} episodes, as data.held_out says", unseen
     what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
     return quarter, what, False
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import NormalDist
 from typing import Final
 
@@ -73,6 +73,22 @@ def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf)) -
     low, high = np.quantile(drawn[weight > 0] / weight[weight > 0], _TAILS)
     wider = _widening(outcomes)
     return max(bounds[0], mean + wider * (float(low) - mean)), min(bounds[1], mean + wider * (float(high) - mean))
+
+
+def resampled(statistic: Callable[[Outcomes], Outcomes], units: int, bounds: Interval) -> Interval:
+    """95 % interval of a statistic of some units, two at least, from draws (B, units) of them to (B,), as the bootstrap
+    of one level; cut to `bounds`.
+
+    Example:
+        >>> resampled(lambda drawn: drawn.sum(axis=1) / drawn.sum(axis=1), 5, (0.0, 2.0))
+        (1.0, 1.0)
+    """
+    from scipy.special import stdtrit
+
+    drawn, value = statistic(_counts(units, 2)), float(statistic(np.ones((1, units)))[0])
+    low, high = np.nanquantile(drawn, _TAILS)
+    wider = float(stdtrit(units - 1, _TAILS[1])) / NormalDist().inv_cdf(_TAILS[1])
+    return max(bounds[0], value + wider * (float(low) - value)), min(bounds[1], value + wider * (float(high) - value))
 
 
 def of_successes(outcomes: Outcomes) -> Interval:

@@ -61,7 +61,7 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     method = METHODS[config.method]
     if method.online:
         require_online(config, getattr(config.baselines, method.name), method.name)
-    run = run_to_write(config)
+    run, config = run_to_write(config), of_recorded(config)
     if method.model is None:
         return train_stage(method.last, config, run)
     parents, sizes = dict[str, StageCheckpoint](), method.last.sizes
@@ -109,6 +109,16 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
     ready = partial(run.take, parents["slots"]) if spec.copies else partial(run.build_on, world)
     record = StageRecord(spec, run.folder, config, parents, groups, ready, pace)
     return run_stage(record, partial(plugins.call, spec.parts, record))
+
+
+def of_recorded(config: ExperimentConfig) -> ExperimentConfig:
+    """Of a set that was recorded elsewhere, the config with the demonstrations as videos, too, where none are named,
+    and the width of their actions where none is typed."""
+    method, data = METHODS[config.method], config.data
+    if config.env.name not in RECORDED or not method.acts or not (data.root or data.demos):
+        return config
+    config = replace(config, data=replace(data, root=data.root or data.demos))
+    return config if config.env.action_dim != 1 else _with_width(StageRecord(method.last, Path(config.out), config))
 
 
 def _with_width(record: StageRecord) -> ExperimentConfig:

@@ -43,6 +43,7 @@ from playslot_rl.storage.checkpoints import (
 )
 from playslot_rl.storage.locks import locked
 from playslot_rl.training.pace import Pace
+from playslot_rl.training.taught import taught
 
 _ROLES: Final[Mapping[str, Literal["train", "demos", ""]]] = {
     "videos": "train", "demos": "demos", "labelled": "demos", "": "",
@@ -52,26 +53,25 @@ PATIENCE: Final = 10.0
 """Seconds in which the children of a killed training end."""
 
 
-def open_videos(config: ExperimentConfig, roots: str, what: str) -> EpisodeFrames:
+def open_videos(config: ExperimentConfig, roots: str, what: str, whole: bool = True) -> EpisodeFrames:
     """Open the data sets of a stage, without the episodes that are kept for a test (`data.tested`); of `data.demos`
-    among several, without the demonstrations that are held out.
+    (empty: `data.root`) among several, or unless `whole` alone, without the demonstrations that are held out.
 
     Raises:
         DataError: none is named, or one cannot be read.
     """
-
     if not roots:
         raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
     named = data_roots(roots)
     names = [root.path for root in named]
     if config.data.tested:
         return split_tested(open_configured(config, roots), config.data.tested)[0]
-    if not config.data.held_out or config.data.demos not in names or len(names) == 1:
+    shown = config.data.demos or roots
+    if not config.data.held_out or shown not in names or (whole and len(names) == 1):
         return open_configured(config, roots)
     parts = {name: open_configured(config, name) for name in names}
-    demos = parts[config.data.demos]
-    free = split_demonstrations(demos, None, config.data.held_out, 0).trained.recordings
-    parts[config.data.demos] = episode_range(demos, 0, free)
+    free = split_demonstrations(parts[shown], None, config.data.held_out, 0).trained.recordings
+    parts[shown] = episode_range(parts[shown], 0, free)
     return weighted([parts[name] for name in names], [root.weight for root in named])
 
 
@@ -124,7 +124,8 @@ class StageRecord:
     @cached_property
     def videos(self) -> EpisodeFrames:
         """What the command names. Raises DataError: nothing, or it cannot be read."""
-        return open_videos(self.config, self.roots, training_command(self.name).partition(" ")[0])
+        what = training_command(self.name).partition(" ")[0]
+        return open_videos(self.config, self.roots, what, self.role == "demos")
 
     @cached_property
     def demos(self) -> DemonstrationSplit:
@@ -238,19 +239,30 @@ class StageRecord:
         require_config(done, self.finishes(), self.spec.typed)
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         if self.role and self.roots:  # a finished stage can be asked for without
-            facts.append(("data", self.data.fingerprint, next(iter(done.meta["data"].values()), "none")))
-        if self.role and self.roots:
+            old = next(iter(done.meta["data"].values()), "none")
+            own = self if self.data.fingerprint == old else self._as(done)
+            facts.append(("data", own.data.fingerprint, old))
             facts.append(("data.drawn", self.drawn or "false", done.meta.get("drawn") or "false"))
         if self.spec.labels and self.roots:
             facts.append((LABELS, self.labels, done.meta.get("labelled")))
         if self.role == "demos" and self.roots:
             ends = [said(plain if scaled(plain) else None) for plain in (self.actions, done.meta.get("actions"))]
             facts.append(("actions", ends[0], ends[1]))
-        for name, got, old in facts:
-            if got != old:
-                raise CheckpointError(f"{name}: got {got}, expected {old} as {path} was trained with: use another out=")
+        for name, got, known in facts:
+            if got != known:
+                raise CheckpointError(
+                    f"{name}: got {got}, expected {known} as {path} was trained with: use another out="
+                )
         print(f"{self.name}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
         return done
+
+    def _as(self, done: StageCheckpoint) -> StageRecord:
+        """With as many demonstrations held out as from a finished model of videos: those of a policy come later."""
+        own, kept = self.config.data, done.meta.get("held_out")
+        if self.role != "train" or kept in (None, own.held_out):
+            return self
+        say_once(f"note: {self.name}: got data.held_out={own.held_out}, but was trained with {kept}")
+        return replace(self, config=replace(self.config, data=replace(own, held_out=kept)))
 
     def finishes(self) -> dict[str, Any]:
         """Parts of `stored`, nested as there, that a finished stage must share."""
@@ -342,10 +354,10 @@ class StageRecord:
         Raises:
             OutputError: full disk, or a folder that cannot be written.
         """
-        known: dict[str, Any] = {}
+        known = taught(self.data, self.config, extra, self.role == "demos") if self.role else {}
         if self.role == "demos":
             tasks = [] if self.data.tasks is None else self.data.tasks.tolist()
-            known = {"actions": self.actions, "tasks": sorted({task for task in tasks if task})}
+            known |= {"actions": self.actions, "tasks": sorted({task for task in tasks if task})}
         if self.spec.labels:
             known["labelled"] = self.labels
         path = checkpoint_folder(self.run, self.name)

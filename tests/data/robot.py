@@ -37,8 +37,10 @@ def write_robot(
     robot: str | None = "arm",
     size: int = 64,
     labelled: bool = True,
+    states: bool = False,
 ) -> Path:
-    """A data set of a square that moves with the first two joints, by LeRobot's writer; its actions, if `labelled`."""
+    """A data set of a square that moves with the first two joints, by LeRobot's writer; its actions, if `labelled`,
+    and as many `states`."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     actions = robot_actions() if actions is None else actions
@@ -53,13 +55,17 @@ def write_robot(
     }
     if not labelled:
         del features["action"]
+    if states:
+        features["observation.state"] = {"dtype": "float32", "shape": (width,), "names": None}
     dataset = LeRobotDataset.create("me/arm", fps=10, features=features, root=root, robot_type=robot, use_videos=False)
     for episode in actions:
         for a in episode:
             frame = np.full((size, size, 3), 40, np.uint8)
             x, y = (int(size / 2 + np.clip(v, -200, 200) / 200 * size / 3) for v in np.asarray(a[:2], float))
             frame[y - 5 : y + 5, x - 5 : x + 5] = (220, 60, 30)
-            dataset.add_frame({CAMERA: frame, "task": "reach"} | ({"action": a} if labelled else {}))
+            own = {"action": a} if labelled else {}
+            own |= {"observation.state": a.astype(np.float32)} if states else {}
+            dataset.add_frame({CAMERA: frame, "task": "reach"} | own)
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     return root

@@ -55,10 +55,11 @@ def tasks_figure(results: Mapping[str, Result], theme: Theme) -> Figure:
 
 
 def _against(axes: Axes, panel: Panel, theme: Theme) -> None:
-    """Success over the panel's axis; what is alike for all of its numbers is a line across."""
+    """Success, or the error, over the panel's axis; what is alike for all of its numbers is a line across."""
+    key, scale = ("mae", 1) if any("mae" in row for row in panel.rows) else ("success_rate", 100)
     for row in (row for row in panel.rows if row["at"] is None):
         colour = theme.series[METHODS[row["method"]].style.colour]
-        axes.axhline(100 * row["success_rate"], color=colour, linestyle="-.", linewidth=1.2, label=row["title"])
+        axes.axhline(scale * row[key], color=colour, linestyle="-.", linewidth=1.2, label=row["title"])
     shown = [row for row in panel.rows if row["at"] is not None]
     series = list(dict.fromkeys((row["method"], row["protocol"], row["title"]) for row in shown))
     numbers = sorted({row["at"] for row in shown})
@@ -67,9 +68,9 @@ def _against(axes: Axes, panel: Panel, theme: Theme) -> None:
         own.sort(key=lambda row: row["at"])
         # Side by side, so that equal rates do not hide each other; by a factor, since the axis is logarithmic.
         aside = 1.035 ** (index - (len(series) - 1) / 2)
-        x, y = [row["at"] * aside for row in own], [100 * row["success_rate"] for row in own]
-        below = [max(0.0, 100 * (row["success_rate"] - row["ci95"][0])) for row in own]
-        above = [max(0.0, 100 * (row["ci95"][1] - row["success_rate"])) for row in own]
+        x, y = [row["at"] * aside for row in own], [scale * row[key] for row in own]
+        below = [max(0.0, scale * (row[key] - row["ci95"][0])) for row in own]
+        above = [max(0.0, scale * (row["ci95"][1] - row[key])) for row in own]
         dream = protocol == "imagination"
         colour = theme.series[style.colour]
         axes.errorbar(
@@ -78,10 +79,10 @@ def _against(axes: Axes, panel: Panel, theme: Theme) -> None:
             elinewidth=1.2, label=f"{title}, imagination" if dream else title,
         )  # fmt: skip
         single = [r for r in panel.jobs if (r["method"], r["protocol"]) == (method, protocol) and r["at"] is not None]
-        single = [row for row in single if row["success_rate"] is not None]
+        single = [row for row in single if row.get(key) is not None]
         if len({(row["world"], row["seed"]) for row in single}) > 1:
             dots = [row["at"] * aside for row in single]
-            axes.plot(dots, [100 * row["success_rate"] for row in single], ".", color=colour, markersize=4, alpha=0.5)
+            axes.plot(dots, [scale * row[key] for row in single], ".", color=colour, markersize=4, alpha=0.5)
     if numbers and numbers[0] == 0:
         axes.set_xscale("symlog", linthresh=min(numbers[1:], default=1))
     else:
@@ -122,6 +123,10 @@ def _finish(axes: Axes, result: Result, theme: Theme) -> None:
         rate = result["references"].get(name, {}).get("success_rate")
         if rate is not None:
             axes.axhline(100 * rate, color=theme.series[7], linestyle=line, linewidth=1.2, label=f"{name} actions")
-    axes.set_ylim(-3, 103)
-    axes.set_ylabel("success rate, %")
+    if result.get("measure") == "actions":
+        axes.set_ylim(bottom=0)
+        axes.set_ylabel("mean absolute error of actions")
+    else:
+        axes.set_ylim(-3, 103)
+        axes.set_ylabel("success rate, %")
     style_axes(axes, theme)

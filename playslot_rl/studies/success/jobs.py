@@ -16,14 +16,17 @@ from playslot_rl.config.methods import METHODS, method_stage
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
-from playslot_rl.data.demonstrations import drawn_among
+from playslot_rl.data.demonstrations import drawn_among, split_demonstrations
 from playslot_rl.data.views import first_demonstrations
+from playslot_rl.data.weighted import open_configured
+from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.actions import require_unseen
 from playslot_rl.evaluation.held_out import held_out_seeds
-from playslot_rl.methods.training import train_model
+from playslot_rl.methods.training import of_recorded, train_model
 from playslot_rl.runs import Run
 from playslot_rl.studies.launch import train
-from playslot_rl.studies.study import Job, absolute, computed, fingerprint_of, job_config
+from playslot_rl.studies.study import Job, absolute, absolute_roots, computed, fingerprint_of, job_config
 from playslot_rl.training.record import open_videos
 
 
@@ -37,6 +40,7 @@ class SuccessJob(Job):
             comparison has one number for all (`behaviour.labelled_demos`).
         policy_of: labels of the job, with the same demonstrations and seed, whose policy is this one's too; None for
             one that trains its own.
+        recorded: whether there is no simulator, and the error of its actions is measured.
         world: number of the world model, or other model of videos, that it builds on; 0 for a method that has none.
     """
 
@@ -47,6 +51,7 @@ class SuccessJob(Job):
     labels: int | None = None
     policy_of: int | None = None
     world: int = 0
+    recorded: bool = False
 
     @property
     def name(self) -> str:
@@ -75,6 +80,8 @@ class SuccessJob(Job):
 
     @property
     def protocols(self) -> tuple[str, ...]:
+        if self.recorded:
+            return ("actions",)
         return ("simulation", "imagination") if METHODS[self.method].imagines else ("simulation",)
 
 
@@ -95,7 +102,9 @@ def success_jobs(config: ExperimentConfig, out: Path) -> list[SuccessJob]:
     seeds = wanted.online_seeds or wanted.seeds
     for world in range(wanted.worlds):
         found += [SuccessJob(name, None, seed, out, world=world) for seed in seeds for name in online]
-    return [job for job in found if not job.world or _builds_on_model(config, job.method)]
+    recorded = config.env.name in RECORDED
+    found = [job for job in found if not job.world or _builds_on_model(config, job.method)]
+    return [replace(job, recorded=True) for job in found] if recorded else found
 
 
 def _builds_on_model(config: ExperimentConfig, method: str) -> bool:
@@ -199,7 +208,7 @@ def success_record(job: SuccessJob, config: ExperimentConfig, parents: Mapping[s
     }
 
 
-RECORDED = Path("data") / "expert"
+EXPERT = Path("data") / "expert"
 
 
 def check_data(config: ExperimentConfig) -> ExperimentConfig:
@@ -209,11 +218,33 @@ def check_data(config: ExperimentConfig) -> ExperimentConfig:
     """
     out = Path(config.out)
     config = replace(config, data=_known(config), method="playslot", demos=None)
+    config = _recorded_elsewhere(config) if config.env.name in RECORDED else config
     if uses_demos(config) and (config.data.demos or _recorded(out)):
-        where = config.data.demos or str(out / RECORDED)
+        where = config.data.demos or str(out / EXPERT)
         check_demos(config, _episodes(where), f"data.demos={where}")
         open_videos(config, where, "compare").require_actions(config.env.action_dim)
     held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0, out)
+    return config
+
+
+def _recorded_elsewhere(config: ExperimentConfig) -> ExperimentConfig:
+    """Of a set without simulator: videos and demonstrations are one set where one is named, the last episodes are held
+    out for all, and as many demonstrations are used as are left where the numbers are the default ones. A DataError
+    where a world model that is named was shown what is held out."""
+    config = of_recorded(config)
+    demos, own = absolute(config.data.demos or config.data.root), config.compare
+    count = _episodes(demos)
+    held = config.data.held_out or count - drawn_among(count, 0, config.collect.validation_episodes)
+    collect = replace(config.collect, validation_episodes=held)  # these alone measure
+    data = replace(config.data, root=absolute_roots(config.data.root), demos=demos, held_out=held)
+    if own.demos == type(own).demos and not own.videos:
+        own = replace(own, demos=(max(count - held, 1),))
+    config = replace(config, data=data, compare=own, collect=collect)
+    check_demos(config, count - held, f"data.demos={demos} beside {held} that are held out")
+    source = split_demonstrations(open_configured(config, demos), None, held, 0).held_out
+    if source is not None and uses_slots(config):
+        for run in filter(None, world_runs(config)):
+            require_unseen(source, Run.open(run).world_stages, held)
     return config
 
 
@@ -276,7 +307,7 @@ def _known(config: ExperimentConfig) -> DataConfig:
 
 
 def _recorded(out: Path) -> bool:
-    return (out / RECORDED / "meta" / "info.json").is_file()
+    return (out / EXPERT / "meta" / "info.json").is_file()
 
 
 def _episodes(root: str | Path) -> int:
@@ -286,7 +317,7 @@ def _episodes(root: str | Path) -> int:
 def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
     """Enough demonstrations for the largest number; at least the preset's, so that the first ones stay the same."""
     most, more = max(config.collect.expert_episodes, *config.compare.numbers), config.collect.validation_episodes
-    there = _episodes(out / RECORDED) if not config.data.demos and _recorded(out) else 0
+    there = _episodes(out / EXPERT) if not config.data.demos and _recorded(out) else 0
     if there not in (0, most + more):
         most = there  # recorded for other numbers, or without ones to hold out
     return collect_demos(replace(config, collect=replace(config.collect, expert_episodes=most)), out)
@@ -297,7 +328,7 @@ def unusual_draw(config: ExperimentConfig, episodes: int) -> dict[str, str]:
     the preset gives of this data set, so that only jobs of another draw are other jobs.
     """
     usual = compose([f"preset={config.preset}", f"env={config.env.name}"]).collect.validation_episodes
-    here = bool(config.data.held_out) and Path(config.data.demos) == Path(config.out) / RECORDED
+    here = bool(config.data.held_out) and Path(config.data.demos) == Path(config.out) / EXPERT
     among = drawn_among(episodes, config.data.held_out, config.collect.validation_episodes)
     return {} if among == drawn_among(episodes, usual if here else 0, usual) else {"drawn_among": str(among)}
 
@@ -318,7 +349,7 @@ class Shared:
         self._demos = open_videos(config, config.data.demos, "compare") if uses_demos(config) else None
         self._draw = unusual_draw(config, self._demos.recordings) if self._demos else {}
         self._supervised = {name for name in config.compare.methods if _supervised(config, name)}
-        self._videos = open_videos(config, config.data.root, "compare").fingerprint if self._supervised else ""
+        self._videos = open_videos(config, config.data.root, "compare", False).fingerprint if self._supervised else ""
 
     def parents(self, job: SuccessJob) -> dict[str, str]:
         """Fingerprints of the weights, by stage, and of the demonstrations that a job builds on."""

@@ -10,8 +10,9 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS, require_told
-from playslot_rl.envs import check_task
+from playslot_rl.envs import RECORDED, check_task
 from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.evaluation.actions import require_offline
 from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.training import check_method
@@ -21,6 +22,7 @@ from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import Status, train
 from playslot_rl.studies.study import Evaluate, Record, count_parameters, made_by
 from playslot_rl.studies.success.block import block_of, with_block
+from playslot_rl.studies.success.errors import ERRORS, error_cell, summarise_errors
 from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import (
     Shared,
@@ -60,6 +62,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
     for protocol in job.protocols:
         info = json_or_nothing(job.run / "evaluation" / protocol / "eval_info.json") if done else {}
         rate = info.get("success_rate")
+        others: dict[str, Any] = {key: info[key] for key in ("mean_return", *ERRORS) if key in info}
         rows.append(
             {
                 "name": job.name,
@@ -78,7 +81,7 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
                 "episodes": info.get("episodes"),
                 "outcomes": None if rate is None else "".join(str(int(e["success"])) for e in info["per_episode"]),
                 "ci95": info.get("ci95"),
-                **({"mean_return": info["mean_return"]} if "mean_return" in info else {}),
+                **others,
                 "mean_steps_to_success": info.get("mean_steps_to_success"),
                 "train_seconds": meta.get("seconds", 0) + own_model_seconds(job) if meta else None,
                 "evaluation_seconds": info.get("wall_seconds"),
@@ -158,13 +161,17 @@ class SuccessMeasure:
         return job_rows(job, self.config.acting.frame_skip, status)
 
     def said(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        if any("mae" in row for row in rows):
+            return ", ".join(f"error {error_cell(row)}" for row in rows if "mae" in row)
         known = [row for row in rows if row["success_rate"] is not None]
         returns = [f"return {row['mean_return']:.2f} in {row['protocol']}" for row in rows if "mean_return" in row]
         return ", ".join([*(f"{100 * row['success_rate']:.0f} % in {row['protocol']}" for row in known), *returns])
 
     def result(self, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         config, own = self.config, self.config.compare
-        summary, reference = summarise(rows), own.reference if own.reference in own.methods else None
+        recorded = config.env.name in RECORDED
+        summary = summarise_errors(rows) if recorded else summarise(rows)
+        reference = own.reference if own.reference in own.methods else None
         others, here = task_results(config), {"env": config.env.full_name, "rows": rows, "summary": summary}
         return {
             "methods": list(own.methods),
@@ -181,6 +188,8 @@ class SuccessMeasure:
             "summary": summary,
             "reference": reference,
             "differences": differences(rows, own.reference),
+            "measure": "actions" if recorded else "success",
+            "held_out": config.data.held_out,
             "across_tasks": joint_table([here, *others], reference) if others else None,
             "references": self._references,
             "rows": rows,
@@ -200,20 +209,34 @@ def check_success(config: ExperimentConfig) -> None:
     finished world model, or one of another task.
     """
     env = config.env
-    check_task(env, expert=not config.data.demos and uses_demos(config))
+    if env.name in RECORDED:
+        check_recorded(config)
+    else:
+        check_task(env, expert=not config.data.demos and uses_demos(config))
     for method in config.compare.methods:
         require_told(env, method)
         check_method(config, method)
     task_results(config, [env.full_name])
     for run in world_runs(config) if uses_slots(config) else ():
         for checkpoint in Run.open(run).world_stages.values() if run else ():
-            require_config(checkpoint, {"env": {"image_size": env.image_size, "action_dim": env.action_dim}})
+            sizes = ("image_size",) if env.name in RECORDED else ("image_size", "action_dim")  # videos have no actions
+            require_config(checkpoint, {"env": {key: getattr(env, key) for key in sizes}})
             trained_on = checkpoint.group(EnvConfig, "env").typed
             if trained_on != env.typed:
                 raise CheckpointError(
                     f"run={run}: got a world model of {' '.join(trained_on)}, expected {' '.join(env.typed)}: "
                     "leave it out to train one"
                 )
+
+
+def check_recorded(config: ExperimentConfig) -> None:
+    """Refuse, by a ConfigError, what cannot be compared without a simulator."""
+    if not (config.data.demos or config.data.root):
+        raise ConfigError(f"data.demos: got nothing with env={config.env.name}, expected a data set with actions")
+    if config.compare.tasks or config.compare.envs:
+        raise ConfigError(f"compare.tasks: got some with env={config.env.name}, expected none: errors have units")
+    for method in config.compare.methods:
+        require_offline(method)
 
 
 def task_results(config: ExperimentConfig, own: Sequence[str] = ()) -> list[dict[str, Any]]:
@@ -241,6 +264,8 @@ def _references(config: ExperimentConfig) -> dict[str, dict[str, Any]]:
     """What the random policy and the scripted expert do in the evaluation episodes, run or read; a ConfigError for an
     evaluation seed that a training data set holds.
     """
+    if config.env.name in RECORDED:
+        return {}
     seeds = held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0)
     with TaskPool(config.acting, config.render) as pool:
         found = run_references(None, config, seeds, pool, cache=Path(config.out) / "references.json")

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from playslot_rl.config.methods import METHODS, stage_title
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
+from playslot_rl.studies.success.errors import error_cell, error_references
 from playslot_rl.studies.success.task_table import task_sections
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
 
@@ -29,6 +30,8 @@ class Panel(NamedTuple):
 
 
 def success_page(result: Result) -> Document:
+    if result.get("measure") == "actions":
+        return _errors_page(result)
     worlds, block = result["worlds"], result["block"]
     levels = "world models, seeds and episodes" if worlds > 1 else "seeds and episodes, of one world model"
     lead = (
@@ -49,6 +52,20 @@ def success_page(result: Result) -> Document:
     title = f"{result['env']}: success against {against}"
     title += ", on a development block" if block["kind"] == "development" else ""
     return Document(title, lead, sections, [Linked("Success rate", "comparison.png")])
+
+
+def _errors_page(result: Result) -> Document:
+    lead = (
+        f"Preset `{result['preset']}`, world models {result['worlds']}, training seeds {_list(result['seeds'])}. "
+        f"Without a simulator each policy acts at the frames of the last {result['held_out']} demonstrations, the same "
+        "for all, which nothing was trained on. The error is the mean absolute one over the dimensions, in the data "
+        "set's units; in brackets its 95 % bootstrap interval over seeds and episodes. R2 is 0 for the mean labelled "
+        "action, 1 for no error. It is no success: a small error may still fail, and another action may succeed."
+    )
+    sections = [_section(panel, result) for panel in panels(result)]
+    sections += [Section(FOOTNOTES, [Notes(_footnotes(result))]), Section("Every job", [_jobs(result["rows"])])]
+    title = f"{result['env']}: error of actions on held-out demonstrations"
+    return Document(title, lead, sections, [Linked("Error of actions", "comparison.png")])
 
 
 def _block(block: Result) -> str:
@@ -119,7 +136,8 @@ def _of_videos(result: Result, rows: Sequence[Result], labels: int) -> Panel:
 
 
 def _section(panel: Panel, result: Result) -> Section:
-    blocks: list[Block] = [_table(panel.rows, panel.axis, [cell(row, result) for row in panel.rows])]
+    rows = [*panel.rows, *error_references(panel.rows)]
+    blocks: list[Block] = [_table(rows, panel.axis, [cell(row, result) for row in rows])]
     alike = [f"{row['title']} {cell(row, result)}" for row in panel.rows if row["at"] is None]
     if alike:
         blocks.append(Text(f"{panel.alike}: {'; '.join(alike)}."))
@@ -139,8 +157,9 @@ def _table(rows: Sequence[Result], axis: str, texts: Sequence[str]) -> Table:
     cells = {(row["title"], row["protocol"], row["at"]): text for row, text in zip(rows, texts, strict=True)}
     numbers = sorted({row["at"] for row in rows} - {None})
     series = dict.fromkeys((row["title"], row["protocol"]) for row in rows if row["at"] is not None)
-    body = [[f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
-    return Table(["", *(f"{n:,} {UNITS[axis]}" for n in numbers)], body)
+    body = [[t if p == "actions" else f"{t}, {p}", *(cells.get((t, p, n), "–") for n in numbers)] for t, p in series]
+    what = "error of actions" if any("mae" in row for row in rows) else ""
+    return Table([what, *(f"{n:,} {UNITS[axis]}" for n in numbers)], body)
 
 
 def _points(row: Result) -> str:
@@ -168,6 +187,8 @@ def budgeted(row: Result, result: Result) -> str:
 
 def cell(row: Result, result: Result) -> str:
     """Rate, interval and range: `97 % (93 to 99; seeds 96 to 98)`; and how many policies there are, if not all."""
+    if "mae" in row:
+        return error_cell(row)
     low, high = (100 * end for end in row["ci95"])
     text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
     several = len(row["worlds"]) > 1
@@ -320,13 +341,16 @@ def _reference(value: Result) -> str:
 
 
 def _outcome(row: Result) -> str:
+    if "mae" in row:
+        return error_cell(row)
     if row["success_rate"] is None:
         return f"return {row['mean_return']:.2f}" if "mean_return" in row else "–"
     return f"{row['successes']} of {row['episodes']}"
 
 
 def _jobs(rows: Sequence[Result]) -> Table:
-    headers = ["job", "protocol", "status", "success", "labels", "environment steps", "training", "evaluation"]
+    outcome = "error" if any("mae" in row for row in rows) else "success"
+    headers = ["job", "protocol", "status", outcome, "labels", "environment steps", "training", "evaluation"]
     body = [
         [
             row["name"],

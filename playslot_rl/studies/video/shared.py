@@ -125,7 +125,7 @@ def check_clips(config: ExperimentConfig) -> None:
     is computed.
     """
     own = config.compare_video
-    trained = open_videos(config, config.data.root, "compare-video")
+    trained = open_videos(config, config.data.root, "compare-video", False)
     folders = {Path(root.path).resolve() for root in data_roots(config.data.root)}
     for tested in tested_clips(config):
         test = test_sets(config)[tested.label]
@@ -171,7 +171,7 @@ def slots_seconds(config: ExperimentConfig) -> float:
 
 def parent_prints(config: ExperimentConfig) -> dict[str, str]:
     """Fingerprints of the videos, the tests and the SAVi that all trainings have in common."""
-    parents = {"videos": open_videos(config, config.data.root, "compare-video").fingerprint}
+    parents = {"videos": open_videos(config, config.data.root, "compare-video", False).fingerprint}
     for label, test in test_sets(config).items():
         parents[f"test {label}".strip()] = open_clips(config, test, 2, 2)[0].fingerprint
     if uses_slots(config):
