@@ -7,6 +7,7 @@ import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -247,6 +248,20 @@ def test_slots_are_floats(model: PlaySlot, video: np.ndarray) -> None:
 
 def test_frames_may_be_reversed(model: PlaySlot, video: np.ndarray) -> None:
     torch.testing.assert_close(model.parse(video[::-1]), model.parse(video[::-1].copy()))
+
+
+def test_the_simulator_of_a_policy_of_every_second_frame_takes_steps_twice_as_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from playslot_rl.acting import simulation
+    from playslot_rl.sharing.folder import SharedPolicyConfig
+
+    monkeypatch.setattr(simulation, "make_simulation_env", lambda env, *_: env)
+    model = PlaySlot.untrained()
+    known: Any = model.simulation()
+    model._policy = SharedPolicyConfig(stride=2)
+    slow: Any = model.simulation()
+    assert (slow.frame_skip, slow.max_steps) == (2 * known.frame_skip, known.max_steps // 2)
 
 
 @pytest.mark.parametrize("wrong", [5, None, ["runs/a"], True, {1}], ids=str)

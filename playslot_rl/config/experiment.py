@@ -48,7 +48,8 @@ class DataConfig(Checked):
         held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
         draw: seed that draws which of the other demonstrations are the first ones; None takes them as recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
-        stride: of each episode every `stride`-th frame is read (`playslot_rl.data.views.every`).
+        stride: of each episode every `stride`-th frame is read (`playslot_rl.data.views.every`); policies act at that
+            rate.
         stride_action: of the actions up to the next frame read, their `mean`, or the `last`: for absolute targets,
             grippers and angles that wrap.
         resize: resize frames of another size than `env.image_size` (area averaging) instead of refusing them.

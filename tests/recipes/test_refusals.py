@@ -41,6 +41,10 @@ MISTYPED = [
 
 REFUSED = [
     # arguments
+    (
+        "train-baseline method=dreamer env=block_reach out={new} data.stride=2",
+        "data.stride: got 2, expected 1: dreamer",
+    ),
     ("collect", "out: got nothing, expected"),
     ("train-slots", "out: got nothing, expected"),
     ("train-dynamics", "(out|run): got nothing, expected"),
