@@ -108,7 +108,7 @@ def test_help_explains_with_examples_and_the_commands_own_keys(
         assert re.search(rf"[ \n]{re.escape(key)}", shown), key
     keys = {found[1] for line in shown.splitlines() if (found := re.match(r"  ([a-z][a-z_.]*)[=.]", line))}
     foreign = {"protocol": ("evaluate", "pipeline"), "policy": ("collect",), "minutes": ("adopt",), "port": ("play",)}
-    foreign |= {"method": ("train-baseline",), "export": ("export",), "plan": ("plan",), "adopt": ("adopt",)}
+    foreign |= {"method": ("train-baseline", "evaluate"), "export": ("export",), "plan": ("plan",), "adopt": ("adopt",)}
     assert not [key for key, of in foreign.items() if key in keys and command not in of]
 
 

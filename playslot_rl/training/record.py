@@ -238,6 +238,7 @@ class StageRecord:
         require_parents(done, self.parents)
         require_config(done, self.finishes(), self.spec.typed)
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
+        own = self
         if self.role and self.roots:  # a finished stage can be asked for without
             old = next(iter(done.meta["data"].values()), "none")
             own = self if self.data.fingerprint == old else self._as(done)
@@ -253,6 +254,9 @@ class StageRecord:
                 raise CheckpointError(
                     f"{name}: got {got}, expected {known} as {path} was trained with: use another out="
                 )
+        if own is not self:
+            kept = own.config.data.held_out
+            say_once(f"note: {self.name}: got data.held_out={self.config.data.held_out}, but was trained with {kept}")
         print(f"{self.name}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
         return done
 
@@ -261,7 +265,6 @@ class StageRecord:
         own, kept = self.config.data, done.meta.get("held_out")
         if self.role != "train" or kept in (None, own.held_out):
             return self
-        say_once(f"note: {self.name}: got data.held_out={own.held_out}, but was trained with {kept}")
         return replace(self, config=replace(self.config, data=replace(own, held_out=kept)))
 
     def finishes(self) -> dict[str, Any]:

@@ -234,7 +234,7 @@ def test_what_stages_inherit_counts_for_all_of_them_in_the_loops_only() -> None:
 # --- the help of a command lists what its recipe reads ------------------------------------------------------------
 
 STORED = {
-    "evaluate": {"method", "out"},
+    "evaluate": {"out", "data.stride"},
     "export": {"method", "env.name"},
     "plan": {"method"},
     "compare": {"out"},
