@@ -14,14 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.config.families import FAMILIES, OGBENCH
+from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS
 from playslot_rl.envs import family_config
 from playslot_rl.envs.pixel_task import Action, PixelTask
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 from playslot_rl.errors import ConfigError
 
 ACTIONS: Final = 5
-GOALS: Final = 5
 """Of a task's evaluation, numbered from 1."""
 CAMERA: Final = "front_pixels"
 DETAIL: Final = 0.005  # under software GL the gripper's finer meshes would cost three quarters of a frame
@@ -149,7 +148,7 @@ class CubeTask(PixelTask):
         env.np_random = rng
         self._move: Move | None = None
         env.action_space.seed(int(rng.integers(2**31)))
-        _, info = env.reset(options={"task_id": 1 + self.episode % GOALS})
+        _, info = env.reset(options={"task_id": 1 + self.episode % OGBENCH_GOALS})
         self._stacks = rng.uniform(0.0, 0.25)  # OGBench's data of two cubes; one is never put on another
         self._start_oracle()
         self._look(info)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from playslot_rl.config import ExperimentConfig
-from playslot_rl.config.methods import METHODS, require_told
+from playslot_rl.config.methods import METHODS, cloning_methods, require_told
 from playslot_rl.envs import RECORDED, gym_id
 from playslot_rl.errors import ConfigError
 
@@ -25,7 +25,7 @@ def main(config: ExperimentConfig) -> None:
             "a run folder, or run=pretrained"
         )
     if config.env.name in RECORDED and method.online:
-        able = ", ".join(name for name, one in METHODS.items() if one.acts and not one.online)
+        able = ", ".join(cloning_methods())
         raise ConfigError(
             f"method: got {method.name}, which learns by acting, with env={config.env.name}, which has no simulator, "
             f"expected one that learns from demonstrations: {able}"

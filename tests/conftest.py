@@ -30,6 +30,7 @@ LONGEST = (
     "methods/test_contract.py",
     "methods/test_what_rows_see.py",
     "recipes/test_robot_actions.py",
+    "recipes/test_robot_errors.py",
     "faults/test_every_command.py",
     "training/test_several_processes.py",
     "recipes/test_several_processes.py",

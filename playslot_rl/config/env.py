@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from playslot_rl.config import metaworld
-from playslot_rl.config.families import FAMILIES, OGBENCH, task_name
+from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS, task_name
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
@@ -201,7 +201,7 @@ class EnvConfig(Checked):
     @property
     def turns(self) -> int:
         """Tasks, or goals, that episodes take in turn by the seed; 1 where all have the same."""
-        return 5 if self.name == "ogbench" and self.goals == "evaluation" else max(1, len(self.tasks))
+        return OGBENCH_GOALS if self.name == OGBENCH and self.goals == "evaluation" else max(1, len(self.tasks))
 
     @property
     def full_name(self) -> str:

@@ -10,6 +10,8 @@ from playslot_rl.config.metaworld import Member
 from playslot_rl.config.plain import check, nearest
 
 OGBENCH: Final = "ogbench"
+OGBENCH_GOALS: Final = 5
+"""Goals of its evaluation, which episodes take in turn."""
 GYM: Final = "gym"
 
 

@@ -138,6 +138,11 @@ _OURS: Final[Mapping[str, str]] = {
 METHODS: Final = plugins.Registry(GROUP, Method, {name: f"playslot_rl.methods.{at}" for name, at in _OURS.items()})
 
 
+def cloning_methods() -> list[str]:
+    """Names of the methods whose policies learn from demonstrations, without acting."""
+    return [name for name, method in METHODS.items() if method.acts and not method.online]
+
+
 def method_stage(method: str) -> str:
     return METHODS[method].last.name
 

@@ -29,7 +29,7 @@ from playslot_rl import keys
 from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
-from playslot_rl.config.methods import METHODS
+from playslot_rl.config.methods import METHODS, cloning_methods
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.demonstrations import split_demonstrations, told_tasks, transitions
 from playslot_rl.data.source import EpisodeFrames
@@ -52,7 +52,7 @@ def require_offline(method: str) -> None:
     """Refuse a method that gives no policy of demonstrations, by a ConfigError."""
     kind = METHODS[method]
     if kind.online or not kind.acts:
-        able = ", ".join(name for name, one in METHODS.items() if one.acts and not one.online)
+        able = ", ".join(cloning_methods())
         what = "learns by acting" if kind.acts else "predicts videos"
         raise ConfigError(f"method: got {method}, which {what}, with protocol=actions, expected one of {able}")
 

@@ -70,9 +70,7 @@ def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf)) -
     values, mean = np.where(there, outcomes, 0.0), float(np.nanmean(outcomes))
     counts = [_counts(units, level) for level, units in enumerate(outcomes.shape)]
     drawn, weight = _sums(counts, values), _sums(counts, there.astype(np.float64))
-    low, high = np.quantile(drawn[weight > 0] / weight[weight > 0], _TAILS)
-    wider = _widening(outcomes)
-    return max(bounds[0], mean + wider * (float(low) - mean)), min(bounds[1], mean + wider * (float(high) - mean))
+    return _widened(mean, drawn[weight > 0] / weight[weight > 0], _widening(outcomes), bounds)
 
 
 def resampled(statistic: Callable[[Outcomes], Outcomes], units: int, bounds: Interval) -> Interval:
@@ -83,12 +81,8 @@ def resampled(statistic: Callable[[Outcomes], Outcomes], units: int, bounds: Int
         >>> resampled(lambda drawn: drawn.sum(axis=1) / drawn.sum(axis=1), 5, (0.0, 2.0))
         (1.0, 1.0)
     """
-    from scipy.special import stdtrit
-
     drawn, value = statistic(_counts(units, 2)), float(statistic(np.ones((1, units)))[0])
-    low, high = np.nanquantile(drawn, _TAILS)
-    wider = float(stdtrit(units - 1, _TAILS[1])) / NormalDist().inv_cdf(_TAILS[1])
-    return max(bounds[0], value + wider * (float(low) - value)), min(bounds[1], value + wider * (float(high) - value))
+    return _widened(value, drawn[~np.isnan(drawn)], _student(units - 1), bounds)
 
 
 def of_successes(outcomes: Outcomes) -> Interval:
@@ -176,9 +170,7 @@ def _sums(counts: Sequence[npt.NDArray[np.float64]], values: Outcomes) -> npt.ND
 
 
 def _widening(outcomes: Outcomes) -> float:
-    """Student's quantile over the normal one, at the degrees of freedom that the levels together have."""
-    from scipy.special import stdtrit
-
+    """`_student` at the degrees of freedom that the levels together have."""
     shares, spent = [], []
     for level, size in enumerate(outcomes.shape):
         of_units = np.moveaxis(outcomes, level, 0).reshape(size, -1)
@@ -188,4 +180,17 @@ def _widening(outcomes: Outcomes) -> float:
             spent.append(shares[-1] ** 2 / (len(means) - 1))
     if sum(spent) == 0:
         return 1.0
-    return float(stdtrit(sum(shares) ** 2 / sum(spent), _TAILS[1])) / NormalDist().inv_cdf(_TAILS[1])
+    return _student(sum(shares) ** 2 / sum(spent))
+
+
+def _student(freedom: float) -> float:
+    """Student's quantile over the normal one."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, _TAILS[1])) / NormalDist().inv_cdf(_TAILS[1])
+
+
+def _widened(value: float, drawn: Outcomes, wider: float, bounds: Interval) -> Interval:
+    """The bootstrap's interval from draws (B,), its ends so many times as far from the value, cut to `bounds`."""
+    low, high = (value + wider * (float(end) - value) for end in np.quantile(drawn, _TAILS))
+    return max(bounds[0], low), min(bounds[1], high)

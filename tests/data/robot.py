@@ -80,3 +80,13 @@ def edit_stats(root: Path, **changed: Any) -> None:
         if value is None:
             del stats["action"][name]
     path.write_text(json.dumps(stats))
+
+
+def meta_of(run: Path, stage: str) -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((run / stage / "checkpoint" / "meta.json").read_text())
+    return values
+
+
+def ends(meta: dict[str, Any]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """The range of a stage's actions, (A,) and (A,)."""
+    return np.float32(meta["actions"]["low"]), np.float32(meta["actions"]["high"])
