@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl import keys
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
-from playslot_rl.config.families import FAMILIES, OGBENCH
+from playslot_rl.config.families import FAMILIES, OGBENCH, member
 from playslot_rl.config.metaworld import NAME as METAWORLD
 from playslot_rl.config.plain import nearest
 from playslot_rl.config.tasks import TASKS
@@ -80,7 +80,7 @@ def family_config(name: str, task: str = "") -> EnvConfig:
         made = EnvConfig(name, warmup_steps=0, task=task or FAMILIES[name].default, **own)
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    return replace(made, max_steps=FAMILIES[name].tasks[made.task].steps)
+    return replace(made, max_steps=member(name, made.task).steps)
 
 
 def play_config(env: EnvConfig) -> EnvConfig:

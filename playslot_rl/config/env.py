@@ -156,8 +156,8 @@ class EnvConfig(Checked):
         camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
         expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
             to its action.
-        task: which task of `metaworld`: `drawer-open`, another of its fifty, or `MT10`, ten of them by the episode; of
-            `ogbench`: `cube-single` or `cube-double`.
+        task: which task of `metaworld`: `drawer-open`, another of its fifty, or several by the episode, `MT10` or
+            `reach+push`; of `ogbench`: `cube-single` or `cube-double`.
         goals: of `ogbench`: its five of `evaluation`, in turn, or `random` ones one after the other, as in its data.
         targets: of `ogbench`: whether they are drawn, translucent; its `visual-` environments hide them.
     """
@@ -182,12 +182,16 @@ class EnvConfig(Checked):
     @property
     def tasks(self) -> tuple[str, ...]:
         """Of several tasks in one, their names; empty of one."""
-        return metaworld.SETS.get(self.task, ())
+        return metaworld.several(self.task)
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """What is to be done in each of `tasks`, as data sets say it."""
         return tuple(metaworld.TASKS[name].sentence for name in self.tasks)
+
+    def serves(self, env: EnvConfig) -> bool:
+        """Whether a world model of this task is one of another, too: the same, or one of several."""
+        return env.typed == self.typed or (env.name == self.name and env.task in self.tasks)
 
     def of_episode(self, seed: int) -> EnvConfig:
         """The task of several whose an episode is: each in turn by the seed; else itself."""

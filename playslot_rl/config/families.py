@@ -52,20 +52,33 @@ def task_name(env: str, task: str) -> str:
     if env == metaworld.BUTTON_PRESS:
         return "button-press"
     family = FAMILIES[env]
+    if env == metaworld.NAME and metaworld.JOINT in task:
+        parts = [name.removesuffix(family.version) for name in task.split(metaworld.JOINT)]
+        for name in parts:
+            check(name in metaworld.TASKS, "env.task", name, f"Meta-World's tasks, joined{nearest(name, metaworld.TASKS, most=3)}")
+        check(len({*parts}) == len(parts), "env.task", task, "each task once")
+        return metaworld.JOINT.join(parts)
     found, count = task.removesuffix(family.version), len(family.tasks)
     known = f"{family.title}'s {count} (docs/reference/environments.md)" if count > 5 else ", ".join(family.tasks)
     check(found in family.tasks, "env.task", task, f"one of {known}{nearest(found, family.tasks, most=3)}")
     return found
 
 
+def member(env: str, task: str) -> Member:
+    """A task of an environment that has several, or a set of them, by what `task_name` reads."""
+    name = task_name(env, task)
+    return metaworld.member(name) if env == metaworld.NAME else FAMILIES[env].tasks[name]
+
+
 def preset_values(env: Mapping[str, Any], preset: str, rollout: int, brought: Collection[str]) -> dict[str, Any]:
     """What a task changes in a preset whose dynamics predict `rollout` frames: the length of its episodes, and of all
     that is as long as they are. No preset knows `env=gym` and tasks that are `brought`: `env` says how long theirs are.
     """
-    family = FAMILIES.get(env["name"])
-    task = str(env.get("task", "")).removesuffix(family.version) if family else ""
-    if family and task in family.tasks:
-        steps = family.tasks[task].steps
+    if env["name"] in FAMILIES:
+        try:
+            steps = member(env["name"], str(env["task"])).steps
+        except ValueError:
+            return {}  # said where the task is read
         rollout = rollout if preset == "paper" else steps - 2
     elif env["name"] in (GYM, *brought) and isinstance(env["max_steps"], int):
         steps = env["max_steps"]

@@ -84,8 +84,22 @@ SETS: Final[dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Several tasks under one name, in Meta-World's order: which of them an episode is follows from its seed."""
 
-EVERY: Final[dict[str, Member]] = TASKS | {
-    name: Member(max(TASKS[task].steps for task in tasks), f"One of {name}: {', '.join(tasks)}.")
-    for name, tasks in SETS.items()
-}
-"""Tasks, and sets of them, which last as long as their longest."""
+JOINT: Final = "+"
+"""Between the names of tasks that make a set."""
+
+
+def several(task: str) -> tuple[str, ...]:
+    """The tasks of a set, by its name or theirs (`reach+push`); empty of one task."""
+    return SETS.get(task, tuple(task.split(JOINT)) if JOINT in task else ())
+
+
+def member(task: str) -> Member:
+    """A task, or a set of them, which lasts as long as its longest."""
+    tasks = several(task)
+    if not tasks:
+        return TASKS[task]
+    return Member(max(TASKS[name].steps for name in tasks), f"One of {task}: {', '.join(tasks)}.")
+
+
+EVERY: Final[dict[str, Member]] = {name: member(name) for name in (*TASKS, *SETS)}
+"""Tasks, and sets of them that have a name."""

@@ -41,8 +41,8 @@ def training(record: StageRecord) -> Training:
     split.trained.require_actions()
     require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
     world = record.world.load_world_model(device)
-    if config.env.tasks or world.env.tasks:
-        require_task(config, world.env, ("task",))  # the policy is told the tasks of its world model
+    if (config.env.tasks or world.env.tasks) and not world.env.serves(config.env):
+        require_task(config, world.env, ("task",))
     world.config, world.env = sizes(config, world.config), record.groups["env"]
     with global_seed(config.seed, 0, "policy"):
         agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)

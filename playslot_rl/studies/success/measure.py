@@ -221,10 +221,10 @@ def check_success(config: ExperimentConfig) -> None:
         for checkpoint in Run.open(run).world_stages.values() if run else ():
             sizes = ("image_size",) if env.name in RECORDED else ("image_size", "action_dim")  # videos have no actions
             require_config(checkpoint, {"env": {key: getattr(env, key) for key in sizes}})
-            trained_on = checkpoint.group(EnvConfig, "env").typed
-            if trained_on != env.typed:
+            trained = checkpoint.group(EnvConfig, "env")
+            if not trained.serves(env):
                 raise CheckpointError(
-                    f"run={run}: got a world model of {' '.join(trained_on)}, expected {' '.join(env.typed)}: "
+                    f"run={run}: got a world model of {' '.join(trained.typed)}, expected {' '.join(env.typed)}: "
                     "leave it out to train one"
                 )
 
