@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from playslot_rl.config import metaworld
-from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS, task_name
+from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS, member, task_name
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
@@ -188,6 +188,13 @@ class EnvConfig(Checked):
     def sentences(self) -> tuple[str, ...]:
         """What is to be done in each of `tasks`, as data sets say it."""
         return tuple(metaworld.TASKS[name].sentence for name in self.tasks)
+
+    @property
+    def other_sentences(self) -> set[str]:
+        """What is to be done in the tasks of its family that it is not."""
+        if self.name not in FAMILIES:
+            return set()
+        return {task.sentence for task in FAMILIES[self.name].tasks.values()} - {member(self.name, self.task).sentence}
 
     def serves(self, env: EnvConfig) -> bool:
         """Whether a world model of this task is one of another, too: the same, or one of several."""

@@ -55,7 +55,8 @@ def task_name(env: str, task: str) -> str:
     if env == metaworld.NAME and metaworld.JOINT in task:
         parts = [name.removesuffix(family.version) for name in task.split(metaworld.JOINT)]
         for name in parts:
-            check(name in metaworld.TASKS, "env.task", name, f"Meta-World's tasks, joined{nearest(name, metaworld.TASKS, most=3)}")
+            near = nearest(name, metaworld.TASKS, most=3)
+            check(name in metaworld.TASKS, "env.task", name, f"Meta-World's tasks, joined{near}")
         check(len({*parts}) == len(parts), "env.task", task, "each task once")
         return metaworld.JOINT.join(parts)
     found, count = task.removesuffix(family.version), len(family.tasks)

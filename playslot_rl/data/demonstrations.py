@@ -237,20 +237,20 @@ def transitions(source: EpisodeFrames) -> Transitions:
 
 def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Tensor | None:
     """Which of the environment's `tasks` each transition is of, int64 (M, 1), by what the data set says of its episode;
-    None where it has one. A DataError where an episode is of none of them."""
-    if not env.tasks:
-        return None
+    None where it has one. A DataError where an episode is of none of them, or of another task of its family."""
     number = {sentence: i for i, sentence in enumerate(env.sentences)}
     there = np.flatnonzero(source.lengths >= 2)
     there = there[np.unique(source.numbers[there], return_index=True)[1]]
     said = [] if source.tasks is None else source.tasks[there].tolist()
-    unknown = sorted({*said} - {*number}) or ([] if said else ["nothing"])
+    unknown = sorted({*said} - {*number} if env.tasks else {*said} & env.other_sentences)
+    if env.tasks and not said:
+        unknown = ["nothing"]
     if unknown:
         raise DataError(
             f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
             "collect them with it"
         )
-    return torch.tensor([number[sentence] for sentence in said])[moves.episode][:, None]
+    return torch.tensor([number[sentence] for sentence in said])[moves.episode][:, None] if env.tasks else None
 
 
 def real_actions(source: EpisodeFrames, rows: npt.NDArray[np.int64], width: int) -> Tensor:

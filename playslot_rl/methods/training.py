@@ -101,7 +101,8 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
             require_parent(config, run, parents["dynamics"], "action_dim")
         elif config.env.action_dim == env.action_dim:  # nothing was typed, and unlabelled videos do not say it
             config = _with_width(StageRecord(spec, run.folder, config))
-        groups["env"] = replace(env, action_dim=config.env.action_dim)
+        one_of_several = env.tasks and env.serves(config.env)
+        groups["env"] = config.env if one_of_several else replace(env, action_dim=config.env.action_dim)
     else:
         groups["model"] = replace(config.model, savi=parents["slots"].sizes[0].savi)
     if spec.sizes:

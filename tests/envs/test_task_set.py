@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.metaworld import SETS, TASKS
 from playslot_rl.envs import make_env, task_config
 from playslot_rl.envs.task_set import TaskSet
+from playslot_rl.errors import ConfigError
 
 MT10 = SETS["MT10"]
 
@@ -59,6 +62,30 @@ def test_an_episode_is_that_of_its_task_alone(env: TaskSet) -> None:
         assert env.places().keys() == alone.places().keys()  # type: ignore[attr-defined]
         np.testing.assert_array_equal(env.segment(), alone.segment())  # type: ignore[attr-defined]
         alone.close()
+
+
+def test_tasks_are_joined_by_their_names() -> None:
+    joined = compose(["env=metaworld", "env.task=reach-v3+door-open", "preset=compact"]).env
+    assert joined.tasks == ("reach", "door-open")
+    assert joined.max_steps == TASKS["door-open"].steps
+    assert [joined.of_episode(seed).task for seed in (6, 7)] == ["reach", "door-open"]
+    assert joined == replace(task_config("metaworld/reach+door-open"), max_steps=joined.max_steps)
+    for wrong, message in {
+        "reach+pusch": "got 'pusch', expected Meta-World's tasks, joined; did you mean push",
+        "reach+MT10": "got 'MT10', expected Meta-World's tasks, joined",
+        "reach+reach": "expected each task once",
+    }.items():
+        with pytest.raises(ConfigError, match=re.escape(message)):
+            task_config(f"metaworld/{wrong}")
+
+
+def test_a_world_model_of_several_serves_each_of_them() -> None:
+    several = task_config("metaworld/reach+door-open")
+    served = {name: several.serves(task_config(f"metaworld/{name}")) for name in ("reach", "door-open", "push", "MT10")}
+    assert served == {"reach": True, "door-open": True, "push": False, "MT10": False}
+    assert several.serves(several)
+    assert not task_config("metaworld/reach").serves(several)
+    assert not several.serves(task_config("button_press"))
 
 
 @pytest.mark.slow

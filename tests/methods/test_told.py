@@ -27,7 +27,7 @@ from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage
 from playslot_rl.world_model import Agent
-from tests.recipes.commands import refused, smoke
+from tests.recipes.commands import instead, refused, smoke
 from tests.training.tiny_stages import videos
 
 MT10 = SETS["MT10"]
@@ -124,6 +124,10 @@ def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
     drawn = drawn_demonstrations(source, 3)
     assert [env.sentences[i] for i in told(drawn)] == drawn.tasks.tolist()  # type: ignore[union-attr]
     assert told_tasks(source, transitions(source), EnvConfig()) is None
+    alone = replace(source, tasks=np.array(["Pull the drawer open."] * 3 + ["My own words."] * 3))
+    assert told_tasks(alone, transitions(alone), task_config("metaworld/drawer-open")) is None
+    with pytest.raises(DataError, match=r"got demonstrations of 'Pull the drawer open\.', expected the tasks of"):
+        told_tasks(alone, transitions(alone), task_config("metaworld/push"))
     for tasks in (None, np.array([*said[:5], "Dance."])):
         with pytest.raises(DataError, match=r"got demonstrations of '(nothing|Dance\.)', expected the tasks of"):
             told(replace(source, tasks=tasks))
@@ -157,7 +161,11 @@ def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
     refused("plan", f"run={run}", message="got 10 tasks, expected one")
     refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="got 10 tasks, expected one")
     refused("train-policy", f"run={run}", f"out={tmp_path / 'one'}", "env.task=push", f"data.demos={demos}",
-            message=r"env\.task: got push, expected MT10")  # fmt: skip
+            message=r"got demonstrations of '.*', expected the tasks of env\.task=push alone")  # fmt: skip
+    pushes, one = tmp_path / "pushes", tmp_path / "pushing"
+    smoke("collect", *instead(MADE, "env.task=push"), "policy=expert", "episodes=6", f"out={pushes}")
+    smoke("train-policy", f"run={run}", f"out={one}", "env.task=push", f"data.demos={pushes}")
+    assert "push:" not in smoke("evaluate", f"run={one}", "episodes=2", "evaluation.references=false").out
     smoke("train-baseline", "preset=smoke", "method=slot_bc", f"run={run}", f"data.demos={demos}", *MADE, f"out={bc}")
     assert "push:" in smoke("evaluate", f"run={bc}", "episodes=2", "evaluation.references=false").out
 

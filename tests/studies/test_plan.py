@@ -163,6 +163,18 @@ def test_the_shipped_world_model_of_another_task_is_refused() -> None:
         check_success(compared("run=pretrained", "env=block_reach"))
 
 
+def test_the_world_model_of_several_tasks_is_one_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = SimpleNamespace(group=lambda *_: EnvConfig("metaworld", task="reach+push"))
+    monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(world_stages={"slots": checkpoint}))
+    monkeypatch.setattr(measure, "require_config", lambda *_: None)
+    given = ["env=metaworld", "run=several", "methods=playslot", "data.demos=demos"]
+    check_success(compared(*given, "env.task=push"))
+    with pytest.raises(
+        CheckpointError, match=r"of env=metaworld env\.task=reach\+push, expected .* env\.task=door-open"
+    ):
+        check_success(compared(*given, "env.task=door-open"))
+
+
 def test_the_world_model_of_another_gymnasium_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = SimpleNamespace(group=lambda *_: EnvConfig("gym", id="FetchReach-v4"))
     monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(world_stages={"slots": checkpoint}))
