@@ -66,24 +66,25 @@ class SeededView(TensorView):
     A reset before the running episode's end starts it again. TorchRL resets more often than there are episodes (when it
     looks at the environment, and after an episode's last step): a reset without a job touches neither the simulator nor
     the renderer, and its observation is all zeros. `jobs` are places in the collection and seeds of episodes that have
-    not been started, `turns` those of `EnvConfig`.
+    not been started, `turns` those of `EnvConfig`; `asks` says whether an expert's actions are read.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = (), turns: int = 1) -> None:
+    def __init__(
+        self, env: gym.Env[Any, Any], jobs: Sequence[tuple[int, int]] = (), turns: int = 1, asks: bool = True
+    ) -> None:
         counter = gym.spaces.Box(0, 2**62, (1,), np.int64)
         counters = dict.fromkeys((EPISODE_INDEX, EPISODE_SEED, EPISODE_STEP, REDRAWN), counter)
         super().__init__(env, {keys.EXPERT_ACTION: env.action_space, **counters})
-        self.jobs, self.turns = deque(jobs), turns
+        self.jobs, self.turns, self.asks = deque(jobs), turns, asks
         self._running: tuple[int, int] | None = None
         self._episode_seed = self._redrawn = self._step = 0
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
-        """One observation, the expert's action for it (zeros without one), and which episode it belongs to."""
+        """One observation, the expert's action for it (zeros where none is asked), and which episode it belongs to."""
         task, space = task_env(self.env), self.action_space
-        expert = getattr(task, "has_expert", True)
         return {
             **super().view(observation, info),
-            keys.EXPERT_ACTION: task.expert_action() if expert else np.zeros(space.shape or (), space.dtype),
+            keys.EXPERT_ACTION: task.expert_action() if self.asks else np.zeros(space.shape or (), space.dtype),
             EPISODE_INDEX: np.array([self._running[0] if self._running else 0], np.int64),
             EPISODE_SEED: np.array([self._episode_seed], np.int64),
             EPISODE_STEP: np.array([self._step], np.int64),
@@ -123,7 +124,8 @@ class EpisodeCollector(Collector):
     """TorchRL's collector, whose batches (T,) are the one whole episode that it is asked for."""
 
     def __init__(self, spec: CollectionSpec) -> None:
-        self._spec, self._view = spec, SeededView(make_env(spec.env, spec.render), turns=spec.env.turns)
+        env, asks = make_env(spec.env, spec.render), spec.policy != "random"
+        self._spec, self._view = spec, SeededView(env, turns=spec.env.turns, asks=asks)
         super().__init__(
             wrap(self._view),
             make_policy(spec),

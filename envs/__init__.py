@@ -219,8 +219,8 @@ def _creator(name: str) -> Any:
 def without_expert(env: EnvConfig) -> ConfigError:
     """What is raised where a task that has no expert is asked for its action."""
     return ConfigError(
-        f"env={env.name}: got a task without an expert, expected one that shows how it is solved: it has a reward only "
-        "(method=dreamer)"
+        f"env={env.name}: got a task without an expert, expected one that shows how it is solved: record with "
+        "policy=random, or learn from its reward (method=dreamer)"
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.envs import dmc_config, dmc_ids, without_expert
+from playslot_rl.envs import dmc_config, dmc_ids
 from playslot_rl.envs.pixel_task import Action, PixelTask, check_actions
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 from playslot_rl.errors import ConfigError
@@ -52,7 +52,7 @@ class DMControlTask(PixelTask):
     averages boxes instead of samples.
     """
 
-    solves = has_expert = False
+    solves = False
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
         "render_modes": ["rgb_array"],
         "render_fps": 50,
@@ -107,9 +107,6 @@ class DMControlTask(PixelTask):
     def _state(self) -> npt.NDArray[np.float32]:
         values = [np.ravel(value) for value in self._last.observation.values()]
         return np.concatenate(values).astype(np.float32)
-
-    def expert_action(self) -> Action:
-        raise without_expert(self.config)
 
     def objects(self) -> tuple[tuple[str, ...], ...]:
         return tuple((name,) for name in self._bodies() if self._simulation.model.body(name).parentid == 0)

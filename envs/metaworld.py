@@ -31,6 +31,9 @@ CAMERAS: Final[dict[str, Camera]] = {
 """Of the tasks whose object the arm hides from `CAMERA`, or whose goal that cuts off."""
 HELD: Final = ("button-press", "assembly", "disassemble", "handle-pull", "pick-out-of-hole", "pick-place-wall")
 """Tasks whose expert's first action is held for the agent step: ButtonPress, as ever, and where that is quicker."""
+LATE: Final = ("dial-turn", "peg-unplug-side", "window-close", "window-open")
+"""Tasks whose rewards depend on what their reset finds: the object's place, or the plug's spin, as the last one left
+them."""
 ROBOT: Final = ("base", "hand")
 PEDESTAL = ("base", "controller_box", "pedestal_feet", "pedestal", "torso", "right_arm_base_link")
 GROUND: Final = ("tablelink", "RetainingWall", "mocap", "")
@@ -86,7 +89,7 @@ class MetaWorldEnv(PixelTask):
         self._simulation.max_path_length = np.iinfo(np.int64).max
         policies: dict[str, Any] = ENV_POLICY_MAP
         self._expert = policies[task + VERSION]()
-        self._held = task in HELD
+        self._held, self._late = task in HELD, task in LATE
         model, camera = self._simulation.model, CAMERAS.get(task, CAMERA)
         self.distance_seen = camera.distance
         self._make_renderer = partial(FrameRenderer, model, camera, self.config.image_size, render or RenderConfig())
@@ -94,7 +97,7 @@ class MetaWorldEnv(PixelTask):
         self._full: npt.NDArray[np.float64] = np.zeros(0)
 
     def _begin(self, rng: np.random.Generator) -> None:
-        """Meta-World's reset done once: its own `reset` runs the hand's 50 settling steps twice."""
+        """Meta-World's reset done once, where that is the same: its own runs the hand's 50 settling steps twice."""
         import mujoco
 
         env = self._simulation
@@ -104,6 +107,11 @@ class MetaWorldEnv(PixelTask):
         for table, before in self._moved:  # the hand settles before the last episode's objects are moved
             table[:] = before
         env.reset_model()
+        if self._late:  # the same draw, on the model that the first reset has moved
+            env._freeze_rand_vec = True
+            mujoco.mj_resetData(env.model, env.data)
+            env.reset_model()
+            env._freeze_rand_vec = False
         mujoco.mj_kinematics(env.model, env.data)  # some tasks place their object after all else
         self._full = env._get_obs()
         self._full[18:36] = env._prev_obs = self._full[:18].copy()

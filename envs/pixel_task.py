@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
+from playslot_rl.envs import without_expert
 from playslot_rl.envs.rendering import FrameRenderer, import_mujoco
 from playslot_rl.envs.variation import Variation
 from playslot_rl.errors import ConfigError
@@ -64,13 +65,19 @@ class PixelTask(gym.Env[Observation, Action]):
     _make_renderer: Callable[[], FrameRenderer]
     solves = True
     """Whether success is measured; else the return is."""
-    has_expert = True
+    has_expert = False
+    """Whether `expert_action` shows how it is solved: true of a class that writes one, unless it says otherwise."""
     distance_seen: float = 1.0
     """Metres from the camera to the middle of what happens."""
     still: ClassVar[tuple[str, ...]] = ()
     """Bodies of an object that stay where they are and look like ground."""
     scenery: ClassVar[bool] = True
     """Whether what belongs to none of `objects` is scenery, which `env.variation` may paint over; else planes alone."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "expert_action" in cls.__dict__:
+            cls.has_expert = bool(cls.__dict__.get("has_expert", True))
 
     def __init__(
         self, config: EnvConfig, render_mode: str | None, *, actions: int = ACTION_DIM, state: int = STATE_DIM
@@ -139,9 +146,9 @@ class PixelTask(gym.Env[Observation, Action]):
     def _state(self) -> npt.NDArray[np.float32]:
         """Proprioception, float32 (4,)."""
 
-    @abstractmethod
     def expert_action(self) -> Action:
-        """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]."""
+        """Action of the scripted expert for the present state: float32 (4,) in [-1, 1]; a ConfigError without one."""
+        raise without_expert(self.config)
 
     def _simulate(self, action: Action) -> tuple[float, bool]:
         """One agent step: its mean reward, and whether any of its environment steps solved the task."""

@@ -77,6 +77,28 @@ def test_its_state_is_as_wide_as_it_says(bring: Bring) -> None:
     assert state_width(compose(wider).env) == 5
 
 
+def test_without_an_expert_it_is_recorded_at_random_and_an_expert_is_refused(bring: Bring) -> None:
+    config = compose(bring("dot_alone", ("    def expert_action(self):", "    def _unused(self):")))
+    check_task(config.env)
+    assert next(record(CollectionSpec.make(config, "random", 1, 3, 0), [0])).actions.any()
+    with pytest.raises(ConfigError, match="env=dot_alone: got a task without an expert, expected one that shows"):
+        check_task(config.env, expert=True)
+    with pytest.raises(ConfigError, match="env=dot_alone: got a task without an expert"):
+        make_env(config.env).unwrapped.expert_action()  # type: ignore[attr-defined]
+
+
+def test_random_actions_ask_no_expert(bring: Bring) -> None:
+    fails = (
+        "        ahead = ",
+        "        raise RuntimeError('a state that the expert does not know')\n        ahead = ",
+    )
+    config = compose(bring("dot_lost", fails))
+    assert make_env(config.env).unwrapped.has_expert  # type: ignore[attr-defined]
+    assert next(record(CollectionSpec.make(config, "random", 1, 3, 0), [0])).actions.any()
+    with pytest.raises(RuntimeError, match="does not know"):
+        next(record(CollectionSpec.make(config, "expert", 1, 3, 0), [0]))
+
+
 def test_a_variation_that_it_cannot_show_is_refused(bring: Bring) -> None:
     varied = compose([*bring("dot_varied"), "env.variation.background=true"]).env
     for use in (check_task, make_env):
