@@ -277,7 +277,7 @@ def run_references(
     """
     actors: dict[str, Actor] = {"random": RandomActor(config.acting.max_steps, config.acting.action_dim)}
     results: dict[str, dict[str, Any]] = {}
-    if pool.take(1)[0].has_expert:
+    if getattr(pool.take(1)[0], "has_expert", True):
         actors["expert"] = ExpertActor()
     else:
         results["expert"] = dict(NOTHING)
