@@ -1,6 +1,6 @@
-"""From `key=value` overrides to an `ExperimentConfig`: Hydra composes the YAML, the dataclasses judge the result.
+"""From `key=value` overrides to an `ExperimentConfig`: Hydra's grammar reads them, the dataclasses judge the result.
 
-`env` and `preset` choose a file of the Hydra group of that name in `playslot_rl/recipes/conf`; every other key sets one
+`env` and `preset` choose a file of the folder of that name in `playslot_rl/recipes/conf`; every other key sets one
 value. A command that continues a run (`CONTINUES`) and is given `run=DIR` starts from `DIR/config.json` instead.
 """
 
@@ -14,7 +14,9 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
+
+import yaml
 
 from playslot_rl.config import ExperimentConfig, from_dict, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
@@ -30,7 +32,10 @@ from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError, first_line
 
 PLAIN_ENV: Final = "button_press"
-"""The task whose values one that another package brings starts from: it asks nothing of the model."""
+"""The task that nothing typed means, and that one that another package brings starts from: it asks nothing of the
+model."""
+PRESET: Final = "compact"
+"""The preset that nothing typed means."""
 FITTED: Final = "playslot_rl.envs.gym_task:fitted"
 METHOD_KEYS: Final = ("method", "compare.methods", "compare.reference")
 CONF_MODULE: Final = "playslot_rl.recipes.conf"
@@ -104,8 +109,8 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         if continues:
             config = _from_run(Path(run), pairs, command == "play")
         else:
-            groups = tuple(f"{group}={pairs[group]}" for group in GROUPS if group in pairs)
-            config = from_dict(ExperimentConfig, _with_task(_presets(groups), _typed(pairs)))
+            base = _presets(pairs.get("env", PLAIN_ENV), pairs.get("preset", PRESET))
+            config = from_dict(ExperimentConfig, _with_task(base, _typed(pairs)))
             if config.env.id and "env.action_dim" not in pairs:  # only the environment knows
                 config = dataclasses.replace(config, env=plugins.call(FITTED, config.env))
         require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
@@ -261,25 +266,30 @@ def _assignments(pairs: Mapping[str, str]) -> list[str]:
 
 
 @functools.cache
-def _presets(groups: tuple[str, ...]) -> dict[str, Any]:
-    """What the YAML files of the chosen groups say; a plain nested dict, not to be changed. A fifth of a second.
+def _said(group: str, name: str) -> dict[str, Any]:
+    """What a YAML file says, beside what another of its folder (`as`) does; nothing where there is none. Not to be
+    changed.
+    """
+    path = resources.files(f"{CONF_MODULE}.{group}") / f"{name}.yaml"
+    if not path.is_file():
+        return {}
+    own = yaml.load(path.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return merged(_said(group, own.pop("as")), own) if "as" in own else own
+
+
+@functools.cache
+def _presets(env: str, preset: str) -> dict[str, Any]:
+    """What the YAML files of a task and a preset say, the later one over the earlier one; not to be changed.
 
     A preset with `of` and `times` is that preset, for this task, with numbers multiplied, and others set (`sets`).
     """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_module
-    from omegaconf import OmegaConf
-
-    chosen = dict(group.split("=", 1) for group in groups)
-    task = TASKS[chosen["env"]] if chosen.get("env", "") in plugins.brought(TASKS_GROUP) else None
-    if task is not None:
-        groups = tuple(f"{group}={name}" for group, name in {**chosen, "env": PLAIN_ENV}.items())
-    with _explained(), initialize_config_module(CONF_MODULE, version_base="1.3"):
-        composed = OmegaConf.to_container(hydra_compose("config", list(groups)), resolve=True)
-    values = cast("dict[str, Any]", composed)
+    task = TASKS[env] if env in plugins.brought(TASKS_GROUP) else None
+    name = env if task is None else PLAIN_ENV
+    values: dict[str, Any] = {"env": _said("env", name)}
+    for group, file in (("preset", preset), ("env_model", name), ("env_preset", f"{name}_{preset}")):
+        values = merged(values, _said(group, file))
     if "times" in values:
-        base = _presets(tuple(f"{group}={name}" for group, name in {**chosen, "preset": values["of"]}.items()))
-        grown = multiplied(merged(to_dict(ExperimentConfig()), base), values["times"])
+        grown = multiplied(merged(to_dict(ExperimentConfig()), _presets(env, values["of"])), values["times"])
         return merged(grown, values.get("sets", {})) | {"preset": values["preset"]}
     return values if task is None else merged(values, {"env": to_dict(task.env), "model": dict(task.model)})
 
