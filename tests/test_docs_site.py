@@ -19,12 +19,14 @@ LOADS = re.compile(r'<(?:script|link|img|iframe)[^>]+?(?:src|href)="(?:https?:)?
 
 
 def build(repository: Path, site: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """`make docs` without the set-up, and without the index for searching, which is no matter here.
+    """`make docs` without the set-up, the index for searching, and ruff, which breaks each long signature into lines in
+    a process of its own: no matter here.
 
     Not --quiet: it silences warnings, and with them what --strict counts.
     """
     subprocess.run(["make", "typing"], cwd=repository, check=True)
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site), *options]
+    program = "import sys; sys.modules['ruff'] = None; from mkdocs.__main__ import cli; cli()"
+    command = [sys.executable, "-c", program, "build", "--strict", "--site-dir", str(site), *options]
     environment = {**os.environ, "DOCS_SEARCH": "false", "NO_MKDOCS_2_WARNING": "1"}
     return subprocess.run(command, cwd=repository, capture_output=True, text=True, env=environment)
 

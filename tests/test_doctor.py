@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -18,11 +19,13 @@ from playslot_rl.runtime.threads import available_cores, set_threads, tune_alloc
 pytestmark = pytest.mark.integration
 
 
-def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_is_well_here(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "cache")), device="cpu")) == 0
-    out = capsys.readouterr().out
+    out, err = capfd.readouterr()
+    assert err == "", "what a library floods its process with is not shown"
+    assert "Traceback" not in out
     for name in ("Python", "packages", "torch", "rendering", "PyAV", "torchcodec", "FFmpeg", "disk", "cores", "cache"):
-        assert f" {name} " in out
+        assert len([line for line in out.splitlines() if f" {name} " in line[:21]]) == 1, name
     assert "drew a 64x64 frame" in out
     assert "everything essential works" in out
 
@@ -30,12 +33,11 @@ def test_all_is_well_here(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_one_failure_fails_the_command_and_shows_its_cure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(checks, "check_rendering", lambda: checks.Check("rendering", "FAIL", "no GL", "install GL"))
+    monkeypatch.setattr(checks, "_ran", lambda _: (False, "no GL"))
     (tmp_path / "file").touch()
     assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "file" / "cache")))) == 1
     out = capsys.readouterr().out
-    assert "FAIL  rendering" in out
-    assert "-> install GL" in out
+    assert re.search("FAIL  rendering .*: no GL\n *-> set MUJOCO_GL", out)
     assert "-> set PLAYSLOT_CACHE" in out
     assert "2 essential part(s) do not work" in out
 
@@ -111,10 +113,3 @@ def test_a_torchcodec_that_does_not_load_is_one_line(tmp_path: Path, monkeypatch
     (tmp_path / "torchcodec" / "__init__.py").write_text("")
     (tmp_path / "torchcodec" / "decoders.py").write_text("")
     assert "0.9.0 loads" in checks.check_torchcodec().found
-
-
-def test_the_doctor_prints_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
-    print(checks.check_torchcodec().line())
-    out, err = capfd.readouterr()
-    assert (out.count("\n"), err) == (1, "")
-    assert "Traceback" not in out
