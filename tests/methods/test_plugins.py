@@ -57,11 +57,18 @@ SMOKE = "preset=smoke env=button_press logging.progress=false"
 
 @pytest.fixture(scope="module")
 def mine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A folder with the tutorial's method, demonstrations, and runs of it and of one of ours; and what was said."""
+    """A folder with the tutorials' method and task, a method and a task that fail, demonstrations, and runs of the good
+    ones and of one of ours; and what was said.
+    """
     site = tmp_path_factory.mktemp("mine") / "site"
-    assert len(module_of("add-a-method.md").splitlines()) < 80
+    for page in ("add-a-method.md", "add-a-task.md"):
+        assert len(module_of(page).splitlines()) < 80
     install(site, "mine", "playslot_rl.methods", "mine = mine:MINE", module_of("add-a-method.md"))
+    install(site, "reach_dot", "playslot_rl.envs", "reach_dot = reach_dot:TASK", module_of("add-a-task.md"))
+    install(site, "broken", "playslot_rl.methods", "broken = broken:METHOD", "raise RuntimeError('no such chip')\n")
+    install(site, "odd", "playslot_rl.envs", "odd = odd:TASK", "TASK = 3\n")
     trained = f"train-baseline {SMOKE} method=Mine baselines.mine.width=3 baselines.mine.steps=2 data.demos=demos"
+    dot = "preset=smoke env=reach_dot logging.progress=false env.max_steps=20"
     said = play(
         site,
         f"collect {SMOKE} policy=expert episodes=4 out=demos",
@@ -69,6 +76,13 @@ def mine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         f"{trained} behaviour.loss=l2 out=run",
         "evaluate run=run episodes=2",
         f"train-baseline {SMOKE} method=resnet_oracle data.demos=demos out=other",
+        f"collect {dot} policy=expert episodes=4 out=dots/demos",
+        f"train-slots {dot} data.root=dots/demos out=dots/world",
+        f"train-baseline {dot} method=resnet_oracle data.demos=dots/demos out=dots/run",
+        "evaluate run=dots/run episodes=4",
+        "train-baseline method=broken out=no",
+        "collect env=odd out=no",
+        "train-baseline method=nothing out=no",
     )
     return site, said
 
@@ -80,6 +94,23 @@ def test_a_method_of_a_package_is_trained_and_evaluated(mine: tuple[Path, str]) 
     stored = json.loads((site / "run" / "mine" / "checkpoint" / "config.json").read_text())
     assert stored["mine"]["width"] == 3
     assert (site / "run" / "evaluation" / "simulation" / "eval_info.json").is_file(), said
+
+
+def test_a_task_of_a_package_is_recorded_and_learned(mine: tuple[Path, str]) -> None:
+    site, said = mine[0] / "dots", mine[1]
+    result = json.loads((site / "run" / "evaluation" / "simulation" / "eval_info.json").read_text())
+    assert result["episodes"] == 4, said
+    stored = json.loads((site / "world" / "slots" / "checkpoint" / "config.json").read_text())
+    assert (stored["env"]["name"], stored["env"]["frame_skip"]) == ("reach_dot", 1)
+
+
+def test_a_package_that_fails_is_one_line_where_it_is_named(mine: tuple[Path, str]) -> None:
+    site, said = mine
+    assert "broken: got broken:METHOD of the package broken, which fails (RuntimeError: no such chip): repair" in said
+    assert "odd: got odd:TASK of the package odd, expected a Task of the name odd" in said, said
+    assert "got 'nothing', expected one of playslot, " in said
+    assert "Traceback" not in said
+    assert not (site / "no").exists()
 
 
 @pytest.mark.slow
@@ -101,24 +132,6 @@ def test_runs_of_other_methods_are_read_without_the_package(mine: tuple[Path, st
     assert "got 'mine', expected one of playslot" in said, said
 
 
-def test_a_task_of_a_package_is_recorded_and_learned(tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    assert len(module_of("add-a-task.md").splitlines()) < 80
-    install(site, "reach_dot", "playslot_rl.envs", "reach_dot = reach_dot:TASK", module_of("add-a-task.md"))
-    smoke = "preset=smoke env=reach_dot logging.progress=false env.max_steps=20"
-    said = play(
-        site,
-        f"collect {smoke} policy=expert episodes=4 out=demos",
-        f"train-slots {smoke} data.root=demos out=world",
-        f"train-baseline {smoke} method=resnet_oracle data.demos=demos out=run",
-        "evaluate run=run episodes=4",
-    )
-    result = json.loads((site / "run" / "evaluation" / "simulation" / "eval_info.json").read_text())
-    assert result["episodes"] == 4, said
-    stored = json.loads((site / "world" / "slots" / "checkpoint" / "config.json").read_text())
-    assert (stored["env"]["name"], stored["env"]["frame_skip"]) == ("reach_dot", 1)
-
-
 @pytest.mark.slow
 def test_the_pipeline_of_a_task_of_a_package_ends(tmp_path: Path) -> None:
     """It draws itself: nobody knows its parts, and its slots are not scored."""
@@ -128,19 +141,3 @@ def test_the_pipeline_of_a_task_of_a_package_ends(tmp_path: Path) -> None:
     assert "out=run: 0" in said, said
     assert (site / "run" / "report.html").is_file()
     assert not (site / "run" / "evaluation" / "slots").exists()
-
-
-def test_a_package_that_fails_is_one_line_where_it_is_named(tmp_path: Path) -> None:
-    site, broken = tmp_path / "site", "raise RuntimeError('no such chip')\n"
-    install(site, "broken", "playslot_rl.methods", "broken = broken:METHOD", broken)
-    install(site, "odd", "playslot_rl.envs", "odd = odd:TASK", "TASK = 3\n")
-    said = play(
-        site,
-        "train-baseline method=broken out=run",
-        "collect env=odd out=data",
-        "train-baseline method=nothing out=run",
-    )
-    assert "broken: got broken:METHOD of the package broken, which fails (RuntimeError: no such chip): repair" in said
-    assert "odd: got odd:TASK of the package odd, expected a Task of the name odd" in said, said
-    assert "got 'nothing', expected one of playslot, " in said
-    assert "Traceback" not in said
