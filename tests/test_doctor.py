@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from playslot_rl import cli
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.recipes import doctor
 from playslot_rl.runtime import checks
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.integration
 
 
 def test_all_is_well_here(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    assert doctor.main(ExperimentConfig(data=DataConfig(cache=str(tmp_path / "cache")), device="cpu")) == 0
+    assert cli.main(["doctor", f"data.cache={tmp_path / 'cache'}", "device=cpu"]) == 0
     out, err = capfd.readouterr()
     assert err == "", "what a library floods its process with is not shown"
     assert "Traceback" not in out

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from damage import CAMERA, ROWS, add_episodes, edit_column, edit_json, frames_of, keep_rows, load
+from damage import CAMERA, ROWS, add_episodes, edit_column, edit_json, frames_of, keep_rows, killed_while, load
 
 from playslot_rl.datasets import merge as merging
 from playslot_rl.datasets.fingerprint import content_fingerprint
@@ -218,20 +218,6 @@ def test_shares_that_make_no_sense_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-KILLED = """
-import sys, time
-from pathlib import Path
-from playslot_rl.datasets import merge as merging
-
-def stop(*_):
-    print("written", flush=True)
-    time.sleep(600)
-
-merging.require_verified = stop  # everything is written, nothing is named yet
-merging.merge([Path(a) for a in sys.argv[2:]], Path(sys.argv[1]))
-"""
-
-
 @pytest.mark.integration
 def test_a_merge_killed_before_it_gets_its_name_leaves_the_sources_and_the_same_command_does_it(
     images: Path, tmp_path: Path
@@ -239,12 +225,17 @@ def test_a_merge_killed_before_it_gets_its_name_leaves_the_sources_and_the_same_
     parts = [shutil.copytree(images, tmp_path / name) for name in ("a", "b")]
     before = [content_fingerprint(part).value for part in parts]
     out = tmp_path / "all"
-    arguments = [sys.executable, "-c", KILLED, str(out), *map(str, parts)]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "written\n"
-        assert any(tmp_path.glob(".all.tmp-*/**/*.parquet"))
-        process.send_signal(signal.SIGKILL)
+
+    def write(tick: Callable[[], None]) -> None:
+        def stop(*_: Any) -> None:
+            tick()
+            time.sleep(600)
+
+        merging.require_verified = stop  # everything is written, nothing is named yet
+        merge(parts, out)
+
+    killed_while(write, 1)
+    assert any(tmp_path.glob(".all.tmp-*/**/*.parquet"))
     assert not out.exists()
     assert [content_fingerprint(part).value for part in parts] == before
     result = merge(parts, out)

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import playslot
 
 pytestmark = pytest.mark.integration
 
@@ -124,12 +125,19 @@ def test_a_method_of_a_package_is_compared(mine: tuple[Path, str]) -> None:
     assert "| mine-d2-s0 | simulation | done |" in (site / "compared" / "comparison.md").read_text(), said
 
 
-def test_runs_of_other_methods_are_read_without_the_package(mine: tuple[Path, str], tmp_path: Path) -> None:
+def test_runs_of_other_methods_are_read_without_the_package(
+    mine: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This process does not find the packages of the folder."""
     site = tmp_path / "site"
     shutil.copytree(mine[0], site, ignore=shutil.ignore_patterns("*.dist-info"))
-    said = play(site, "evaluate run=other episodes=2", "evaluate run=run episodes=2")
-    assert (site / "other" / "evaluation" / "simulation" / "eval_info.json").is_file(), said
-    assert "got 'mine', expected one of playslot" in said, said
+    monkeypatch.chdir(site)
+    done = playslot("evaluate", "run=other", "episodes=2")
+    assert (done.code, done.err) == (0, "")
+    assert (site / "other" / "evaluation" / "simulation" / "eval_info.json").is_file()
+    done = playslot("evaluate", "run=run", "episodes=2")
+    assert done.code != 0
+    assert "got 'mine', expected one of playslot" in done.err
 
 
 @pytest.mark.slow

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -74,8 +73,11 @@ def test_a_run_is_not_written_over_itself(halves: Path) -> None:
 
 @pytest.mark.integration
 @pytest.mark.parametrize("arguments", [(), ("pretrained/button_press",), ("no/such/run", "model")])
-def test_bad_arguments_are_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "playslot_rl.sharing.ship", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert re.fullmatch(r"ship: error: .*, expected .*\n", done.stderr)
+def test_bad_arguments_are_one_line(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["ship", *arguments])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=r"^ship: error: .*, expected .*(?!\n)$"):
+        runpy.run_path(str(module.__file__), run_name="__main__")
+    assert capsys.readouterr() == ("", "")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import multiprocessing
 import os
-import signal
-import subprocess
 import sys
 import threading
 import time
@@ -86,17 +85,15 @@ def test_training_changes_weights_and_codebook_but_not_the_frozen_part(tmp_path:
 
 @pytest.mark.integration
 def test_a_run_killed_by_the_system_ends_with_the_same_weights(tmp_path: Path) -> None:
-    script = Path(__file__).with_name("toy_stage.py")
-    command = [sys.executable, str(script), str(tmp_path / "killed"), "12", "0.1"]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.Popen(command, env=environment)
+    process = multiprocessing.get_context("fork").Process(target=train, args=(tmp_path / "killed", 12, 0.1))
+    process.start()
     deadline = time.monotonic() + 60
     while not (tmp_path / "killed" / "checkpoints" / "step_00000003").exists():
         assert time.monotonic() < deadline
-        assert process.poll() is None
+        assert process.is_alive()
         time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.kill()
+    process.join()
     assert not (tmp_path / "killed" / "checkpoints" / "step_00000012").exists()
     assert train(tmp_path / "killed")[2] >= 3
     train(tmp_path / "whole")

@@ -1,11 +1,7 @@
-"""A small stage with everything that makes resuming hard: an EMA codebook, global randomness, a frozen part.
-
-Run as a script it trains in its own process: `python toy_stage.py FOLDER STEPS SECONDS_A_STEP`.
-"""
+"""A small stage with everything that makes resuming hard: an EMA codebook, global randomness, a frozen part."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -62,8 +58,3 @@ def toy_config(steps: int = 12, **changes: float) -> StageConfig:
 def train(folder: Path, steps: int = 12, delay: float = 0.0) -> tuple[ToyStage, TrainingState, int]:
     stage = ToyStage(delay)
     return stage, *fit(Part("toy", stage, toy_config(steps)), folder, seed=3, identity={"data": "abc"})
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    train(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))
