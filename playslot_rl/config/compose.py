@@ -273,7 +273,8 @@ def _said(group: str, name: str) -> dict[str, Any]:
     path = resources.files(f"{CONF_MODULE}.{group}") / f"{name}.yaml"
     if not path.is_file():
         return {}
-    own = yaml.load(path.read_text(encoding="utf-8"), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times as fast, where libyaml is there
+    own: dict[str, Any] = yaml.load(path.read_text(encoding="utf-8"), loader)
     return merged(_said(group, own.pop("as")), own) if "as" in own else own
 
 
