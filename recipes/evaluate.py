@@ -118,7 +118,7 @@ def once(config: ExperimentConfig) -> bool:
     """Evaluate under `config.protocol`, without a report, unless the same policy was measured so before; whether it was
     measured now.
     """
-    from playslot_rl.evaluation.actions import asked
+    from playslot_rl.evaluation.actions import asked, error_text
     from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
 
     run, protocol = Run.of(config), config.protocol
@@ -128,12 +128,12 @@ def once(config: ExperimentConfig) -> bool:
     else:
         facts |= {"episodes": config.episodes or DEFAULT_EPISODES, "seed": config.seed}
         facts |= task_facts(config, config.seed)
-    said = scored if protocol == "actions" else rate
     stored = run.result(f"evaluation/{protocol}/eval_info.json", facts)
     if stored is None:
         main(config, report=False)
         return True
-    print(f"{protocol}: measured before, {said(stored)}, skipped", flush=True)
+    said = f"error {error_text(stored)}" if protocol == "actions" else rate(stored)
+    print(f"{protocol}: measured before, {said}, skipped", flush=True)
     return False
 
 
@@ -176,10 +176,12 @@ def describe(result: dict[str, Any], run: Path) -> str:
 
 def describe_actions(result: dict[str, Any], run: Path) -> str:
     """The error of actions in a few lines: the policy, what to hold it against, and each dimension."""
+    from playslot_rl.evaluation.actions import error_text
+
     references = result["references"]
     rows = [(METHODS[result["method"]].title, result)]
     rows += [("constant mean action", references["constant"]), ("previous action again", references["previous"])]
-    lines = [f"{name:>22}: {scored(row)}" for name, row in rows]
+    lines = [f"{name:>22}: error {error_text(row)}" for name, row in rows]
     for row in result["per_dimension"]:
         lines.append(f"{row['name']:>22}: error {row['mae']:.3g}, of the constant {row['constant_mae']:.3g}")
     if result["untold"]:
@@ -187,13 +189,3 @@ def describe_actions(result: dict[str, Any], run: Path) -> str:
     path = run / "evaluation" / "actions" / "eval_info.json"
     counted = f"{result['episodes']} held-out episodes, {result['rows']:,} actions of {result['data']['name']}"
     return "\n".join([*lines, f"{counted}, {result['wall_seconds']:.0f} s; written to {path}"])
-
-
-def scored(row: dict[str, Any]) -> str:
-    """Mean absolute error in the data set's units and R2, with their intervals: `error 4.2 (3.9 to 4.6), R2 0.71`."""
-    parts = []
-    for name, word, form in (("mae", "error", ".3g"), ("r2", "R2", ".2f")):
-        if row[name] is not None:
-            ends = row["ci95"][name]
-            parts.append(f"{word} {row[name]:{form}}" + (f" ({ends[0]:{form}} to {ends[1]:{form}})" if ends else ""))
-    return ", ".join(parts)

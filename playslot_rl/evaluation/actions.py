@@ -36,6 +36,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import chosen_episodes
 from playslot_rl.data.weighted import open_configured
 from playslot_rl.errors import CheckpointError, ConfigError, DataError
+from playslot_rl.evaluation.held_out import trained_on
 from playslot_rl.evaluation.intervals import resampled
 from playslot_rl.evaluation.success import hardware, run_facts
 from playslot_rl.runs import Run
@@ -94,17 +95,16 @@ def require_unseen(
 ) -> tuple[str, ...]:
     """Refuse, by a DataError, episodes that a stage was trained on; returns the stages that do not say. Stages that
     hold out as many of the set (`held_out`, if it is theirs) would not have been."""
-    seen = {name: set(stage.meta["trained_on"]) for name, stage in stages.items() if "trained_on" in stage.meta}
-    there = set([] if source.origins is None else source.origins.tolist())
-    met = {name: len(there & ones) for name, ones in seen.items() if there & ones}
+    counts = trained_on(source, {name: stage.meta for name, stage in stages.items()})
+    met = {name: count for name, count in counts.items() if count}
     if met:
         which = ", ".join(met)
         cure = f"train {which} with data.held_out={held_out}, too, or name" if held_out else "name"
         raise DataError(
-            f"data.demos={source.name}: got {max(met.values())} of {len(there)} episodes that {which} "
+            f"data.demos={source.name}: got {max(met.values())} of {source.recordings} episodes that {which} "
             f"{'were' if len(met) > 1 else 'was'} trained on, expected none: {cure} another set by data.demos="
         )
-    return tuple(name for name, stage in stages.items() if stage.meta["data"] and name not in seen)
+    return tuple(name for name, count in counts.items() if count is None and stages[name].meta["data"])
 
 
 def _places(roots: str) -> list[Path]:
@@ -199,6 +199,20 @@ def scores(errors: Errors, constant: Errors, deviation: Floats) -> dict[str, Any
         bounds = (-np.inf, 1.0) if name == "r2" else (0.0, np.inf)
         intervals[name] = list(resampled(way, len(errors.rows), bounds)) if some else None
     return {**found, "ci95": intervals}
+
+
+def error_text(row: Mapping[str, Any]) -> str:
+    """`4.2 (3.9 to 4.6), R2 0.71 (0.66 to 0.75)`: mean absolute error in the data set's units and R2, with their
+    intervals as far as `ci95` has them: one of each, or the error's alone.
+    """
+    known = row.get("ci95") or {}
+    known = known if isinstance(known, Mapping) else {"mae": known}
+    texts = []
+    for name, form in (("mae", ".3g"), ("r2", ".2f")):
+        ends = known.get(name)
+        interval = f" ({ends[0]:{form}} to {ends[1]:{form}})" if ends else ""
+        texts += [] if row[name] is None else [f"{row[name]:{form}}{interval}"]
+    return ", R2 ".join(texts)
 
 
 def measure_actions(

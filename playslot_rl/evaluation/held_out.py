@@ -74,8 +74,8 @@ def _candidates(
 ) -> tuple[Ints, str, bool]:
     numbers = source.numbers[usable]
     quarter = usable[np.isin(numbers, _last_quarter(source, numbers))]
-    world = [metas[stage] for stage in ("slots", "dynamics") if stage in metas]
-    trained = [meta for meta in world if str(meta.get("data", {}).get("train", "")) == source.fingerprint]
+    world = {stage: metas[stage] for stage in ("slots", "dynamics") if stage in metas}
+    trained = [meta for meta in world.values() if str(meta.get("data", {}).get("train", "")) == source.fingerprint]
     if trained:
         chosen = usable
         for meta in trained:  # each stage holds out by its own seed and clips; checkpoints of before say no share
@@ -91,17 +91,27 @@ def _candidates(
         return quarter, "the world model's own videos, none of which were held out", False
     last = _policy_held_out(source, metas.get("policy", {}), config)
     if len(chosen := usable[numbers >= source.recordings - last]):
-        unseen = bool(world) and all(int(meta.get("held_out", 0)) >= last for meta in world)
+        unseen = bool(world) and all(int(meta.get("held_out", 0)) >= last for meta in world.values())
         why = (
             "training" if unseen else "the policy's training; the checkpoints do not say whether the world model's, too"
         )
         return chosen, f"the last {last} episodes, which are held out from {why}", unseen
     if len(chosen := usable[numbers >= source.recordings - config.held_out]):
-        mine = set() if source.origins is None else set(source.origins[chosen].tolist())
-        unseen = bool(world and mine) and all("trained_on" in m and not mine & {*m["trained_on"]} for m in world)
+        unseen = bool(world) and all(count == 0 for count in trained_on(source, world, chosen).values())
         return chosen, f"the last {config.held_out} episodes, as data.held_out says", unseen
     what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
     return quarter, what, False
+
+
+def trained_on(
+    source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], chosen: Ints | slice = slice(None)
+) -> dict[str, int | None]:
+    """How many of some episodes each stage was trained on, as its checkpoint's meta says; None where that does not say
+    what it saw, or nobody knows which episodes these are.
+    """
+    there = None if source.origins is None else {*source.origins[chosen].tolist()}
+    seen = {name: None if there is None else meta.get("trained_on") for name, meta in metas.items()}
+    return {name: None if ones is None else len((there or set()) & {*ones}) for name, ones in seen.items()}
 
 
 def _last_quarter(source: EpisodeFrames, numbers: Ints) -> Ints:
