@@ -1,7 +1,4 @@
-"""The error of actions in place of success, where there is no simulator: its rows pooled over world models and seeds.
-
-Episode e of E, with n_e of N actions and mean error m_e, counts as E n_e m_e / N, so that the mean is that of actions.
-"""
+"""The error of actions in place of success, where there is no simulator: rows pooled over world models and seeds."""
 
 from __future__ import annotations
 
@@ -10,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from playslot_rl.evaluation.intervals import Outcomes, hierarchical
-from playslot_rl.studies.success.summary import CELL, cells
+from playslot_rl.evaluation.intervals import hierarchical
+from playslot_rl.studies.success.summary import CELL, cells, finished, outcomes_of
 
 ERRORS: Final = ("mae", "rmse", "r2", "references", "per_episode")
 """What a job's row has of its `eval_info.json`."""
@@ -20,21 +17,21 @@ ERRORS: Final = ("mae", "rmse", "r2", "references", "per_episode")
 def summarise_errors(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One row a cell, as `summarise`: `mae`, `rmse` and `r2` are means over its runs, so are those of `references`, and
     `ci95` is the interval of `mae`."""
-    return [_summary(cell, runs) for cell, runs in cells(row for row in rows if "mae" in row).items()]
+    return [_summary(cell, runs) for cell, runs in cells(finished(rows)).items()]
 
 
 def _summary(cell: tuple[Any, ...], runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    names = list(runs[0]["references"])
+    names, seeds = list(runs[0]["references"]), sorted({run["seed"] for run in runs})
     return {
         **dict(zip(CELL, cell, strict=True)),
         "title": runs[0]["title"],
         **{key: runs[0][key] for key in ("agent_steps", "env_steps", "labelled_demos")},
         "worlds": sorted({run["world"] for run in runs}),
-        "seeds": sorted({run["seed"] for run in runs}),
+        "seeds": seeds,
         "runs": len(runs),
         "episodes": runs[0]["episodes"],
         **_means(runs),
-        "ci95": list(hierarchical(_outcomes(runs), (0.0, np.inf))),
+        "ci95": list(hierarchical(outcomes_of(runs, seeds), (0.0, np.inf))),
         "references": {name: _means([run["references"][name] for run in runs]) for name in names},
         "train_seconds": sum(run["train_seconds"] for run in runs) / len(runs),
     }
@@ -43,18 +40,6 @@ def _summary(cell: tuple[Any, ...], runs: Sequence[Mapping[str, Any]]) -> dict[s
 def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
     known = {key: [row[key] for row in rows if row[key] is not None] for key in ("mae", "rmse", "r2")}
     return {key: float(np.mean(values)) if values else None for key, values in known.items()}
-
-
-def _outcomes(runs: Sequence[Mapping[str, Any]]) -> Outcomes:
-    """Errors (W, S, E); NaN where a seed has no run."""
-    worlds, seeds = (sorted({run[key] for run in runs}) for key in ("world", "seed"))
-    found = np.full((len(worlds), len(seeds), runs[0]["episodes"]), np.nan)
-    for run in runs:
-        weight = np.asarray(run["per_episode"]["rows"])
-        found[worlds.index(run["world"]), seeds.index(run["seed"])] = (
-            weight * len(weight) / weight.sum() * np.asarray(run["per_episode"]["mae"])
-        )
-    return found
 
 
 def error_references(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -66,11 +51,3 @@ def error_references(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         for name, title in titles.items()
         for number, row in at.items()
     ]
-
-
-def error_cell(row: Mapping[str, Any]) -> str:
-    """`4.2 (3.9 to 4.6), R2 0.71`."""
-    ends = row.get("ci95")
-    ends = ends.get("mae") if isinstance(ends, Mapping) else ends
-    interval = f" ({ends[0]:.3g} to {ends[1]:.3g})" if ends else ""
-    return f"{row['mae']:.3g}{interval}" + ("" if row["r2"] is None else f", R2 {row['r2']:.2f}")

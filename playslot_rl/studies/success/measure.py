@@ -12,7 +12,7 @@ from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_
 from playslot_rl.config.methods import METHODS, require_told
 from playslot_rl.envs import RECORDED, check_task
 from playslot_rl.errors import CheckpointError, ConfigError
-from playslot_rl.evaluation.actions import require_offline
+from playslot_rl.evaluation.actions import error_text, require_offline
 from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.training import check_method
@@ -22,7 +22,7 @@ from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import Status, train
 from playslot_rl.studies.study import Evaluate, Record, count_parameters, made_by
 from playslot_rl.studies.success.block import block_of, with_block
-from playslot_rl.studies.success.errors import ERRORS, error_cell, summarise_errors
+from playslot_rl.studies.success.errors import ERRORS, summarise_errors
 from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import (
     Shared,
@@ -162,7 +162,7 @@ class SuccessMeasure:
 
     def said(self, rows: Sequence[Mapping[str, Any]]) -> str:
         if any("mae" in row for row in rows):
-            return ", ".join(f"error {error_cell(row)}" for row in rows if "mae" in row)
+            return ", ".join(f"error {error_text(row)}" for row in rows if "mae" in row)
         known = [row for row in rows if row["success_rate"] is not None]
         returns = [f"return {row['mean_return']:.2f} in {row['protocol']}" for row in rows if "mean_return" in row]
         return ", ".join([*(f"{100 * row['success_rate']:.0f} % in {row['protocol']}" for row in known), *returns])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from playslot_rl.config.methods import METHODS, stage_title
+from playslot_rl.config.methods import METHODS, stage_named
+from playslot_rl.evaluation.actions import error_text
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
-from playslot_rl.studies.success.errors import error_cell, error_references
+from playslot_rl.studies.success.errors import error_references
 from playslot_rl.studies.success.task_table import task_sections
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
 
@@ -142,12 +144,14 @@ def _section(panel: Panel, result: Result) -> Section:
     if alike:
         blocks.append(Text(f"{panel.alike}: {'; '.join(alike)}."))
     if panel.differences:
-        title = METHODS[result["reference"]].title
+        title, errors = METHODS[result["reference"]].title, result.get("measure") == "actions"
+        what = f"Points more or less than {title} in simulation"
+        if errors:
+            what = f"Error less that of {title} (below 0 is better than {title}, above 0 is worse)"
         caption = (
-            f"Points more or less than {title} in simulation, on pairs of the same world model, seed and episode; bold "
-            "where the 95 % interval leaves out 0."
+            f"{what}, on pairs of the same world model, seed and episode; bold where the 95 % interval leaves out 0."
         )
-        table = _table(panel.differences, panel.axis, [_points(row) for row in panel.differences])
+        table = _table(panel.differences, panel.axis, [_apart(row, errors) for row in panel.differences])
         blocks.append(Table([f"less {title}", *table.headers[1:]], table.rows, caption))
     return Section(panel.heading, blocks)
 
@@ -162,10 +166,11 @@ def _table(rows: Sequence[Result], axis: str, texts: Sequence[str]) -> Table:
     return Table([what, *(f"{n:,} {UNITS[axis]}" for n in numbers)], body)
 
 
-def _points(row: Result) -> str:
-    """`+35 (28 to 42)`, bold where 0 is left out."""
-    value, low, high = (f"{round(100 * number):+d}" for number in (row["difference"], *row["ci95"]))
-    text = f"{value} ({low} to {high})".replace("-", "−").replace("+0", "0")
+def _apart(row: Result, errors: bool) -> str:
+    """`+35 (28 to 42)`, in points of success or in units of the error, bold where 0 is left out."""
+    numbers = [row["difference"], *row["ci95"]]
+    value, low, high = (f"{number:+.3g}" if errors else f"{round(100 * number):+d}" for number in numbers)
+    text = re.sub(r"[+-]0(?![.\d])", "0", f"{value} ({low} to {high})").replace("-", "−")
     return f"**{text}**" if row["leaves_out_0"] else text
 
 
@@ -188,7 +193,7 @@ def budgeted(row: Result, result: Result) -> str:
 def cell(row: Result, result: Result) -> str:
     """Rate, interval and range: `97 % (93 to 99; seeds 96 to 98)`; and how many policies there are, if not all."""
     if "mae" in row:
-        return error_cell(row)
+        return error_text(row)
     low, high = (100 * end for end in row["ci95"])
     text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
     several = len(row["worlds"]) > 1
@@ -259,7 +264,8 @@ def _shared(result: Result) -> list[str]:
     for stage, models in result["latent_models"].items():
         seconds = ", ".join(f"{model['seconds']:.0f}" for model in models)
         notes.append(
-            f"{stage_title(stage)}: {seconds} s of training on {models[0]['episodes']} videos without actions, {rest}."
+            f"{stage_named(stage).title}: {seconds} s of training on {models[0]['episodes']} videos without actions, "
+            f"{rest}."
         )
     models = [METHODS[method].model for method in dict.fromkeys(row["method"] for row in result["rows"])]
     own = [model.title for model in models if model and model.labels and model.name not in result["latent_models"]]
@@ -342,7 +348,7 @@ def _reference(value: Result) -> str:
 
 def _outcome(row: Result) -> str:
     if "mae" in row:
-        return error_cell(row)
+        return error_text(row)
     if row["success_rate"] is None:
         return f"return {row['mean_return']:.2f}" if "mean_return" in row else "–"
     return f"{row['successes']} of {row['episodes']}"

@@ -1,4 +1,8 @@
-"""Rows of finished jobs pooled over world models and policy seeds: rates, differences to a reference, over tasks."""
+"""Rows of finished jobs pooled over world models and policy seeds: rates, differences to a reference, over tasks.
+
+Without a simulator the outcome of an episode is its actions' error: episode e of E, with n_e of N actions and mean
+error m_e, counts as E n_e m_e / N, so that the mean is that of actions.
+"""
 
 from __future__ import annotations
 
@@ -30,17 +34,25 @@ def cells(rows: Iterable[Row]) -> dict[tuple[Any, ...], list[Row]]:
 
 
 def finished(rows: Iterable[Row]) -> list[Row]:
-    return [row for row in rows if row["success_rate"] is not None]
+    return [row for row in rows if row["success_rate"] is not None or "mae" in row]
 
 
 def outcomes_of(runs: Sequence[Row], seeds: Sequence[int]) -> Outcomes:
-    """Outcomes (W, S, E) of a cell's runs, 1 for a success; NaN where a seed has no run."""
+    """Outcomes (W, S, E) of a cell's runs, 1 for a success, or errors; NaN where a seed has no run."""
     worlds = sorted({run["world"] for run in runs})
-    found = np.full((len(worlds), len(seeds), len(runs[0]["outcomes"])), np.nan)
+    found = np.full((len(worlds), len(seeds), runs[0]["episodes"]), np.nan)
     for run in runs:
         if run["seed"] in seeds:
-            found[worlds.index(run["world"]), seeds.index(run["seed"])] = [int(one) for one in run["outcomes"]]
+            found[worlds.index(run["world"]), seeds.index(run["seed"])] = _of_episodes(run)
     return found
+
+
+def _of_episodes(run: Row) -> Sequence[float]:
+    if "mae" not in run:
+        return [int(one) for one in run["outcomes"]]
+    weights = np.asarray(run["per_episode"]["rows"])
+    errors: list[float] = (weights * len(weights) / weights.sum() * np.asarray(run["per_episode"]["mae"])).tolist()
+    return errors
 
 
 def summarise(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -75,9 +87,10 @@ def _mean(values: Iterable[float | None]) -> int | None:
 
 
 def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
-    """Success of each cell less that of the reference method in simulation, on pairs of the same world model, seed and
-    episode; `demos` and `labels` are those of the pair, and `leaves_out_0` says that the interval does. A method of one
-    world model, finished or not, meets all of the other's.
+    """Success in simulation of each cell, or its error of actions, less that of the reference method, on pairs of the
+    same world model, seed and episode; `demos` and `labels` are those of the pair, `leaves_out_0` says that the
+    interval does, and `better` whether the cell then is, None where it does not: of errors the lower is better. A
+    method of one world model, finished or not, meets all of the other's.
 
     What learns from the labels alone meets the reference at every number of videos, an oracle at every number of
     labels, and a method that acts at all of them.
@@ -86,7 +99,7 @@ def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
     for row in rows:  # those that are to come, too
         worlds.setdefault(row["method"], set()).add(row["world"])
     for other, there in known.items():
-        if other[:2] != (reference, "simulation"):
+        if other[0] != reference or other[1] not in ("simulation", "actions"):
             continue
         for cell, runs in known.items():
             if cell[:2] == other[:2] or not (at := _pair(cell, other)):
@@ -96,8 +109,9 @@ def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
             if not sides[0]:
                 continue
             seeds = sorted({run["seed"] for run in sides[0]})
-            outcomes = paired(*(outcomes_of(side, seeds) for side in sides))
-            low, high = hierarchical(outcomes, (-1.0, 1.0))
+            outcomes, of_errors = paired(*(outcomes_of(side, seeds) for side in sides)), "mae" in there[0]
+            low, high = hierarchical(outcomes, *([] if of_errors else [(-1.0, 1.0)]))
+            clear = low > 0 or high < 0
             found.append(
                 {
                     **dict(zip(CELL, (*cell[:2], *at), strict=True)),
@@ -105,7 +119,8 @@ def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
                     "seeds": seeds,
                     "difference": float(np.nanmean(outcomes)),
                     "ci95": [low, high],
-                    "leaves_out_0": low > 0 or high < 0,
+                    "leaves_out_0": clear,
+                    "better": (high < 0) == of_errors if clear else None,
                 }
             )
     return found

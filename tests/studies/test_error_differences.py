@@ -1,0 +1,80 @@
+"""Without a simulator methods differ by the error of their actions, on pairs of the same seed and episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jobs_on_disk import comparison
+
+from playslot_rl.config.methods import METHODS
+from playslot_rl.evaluation.intervals import hierarchical
+from playslot_rl.studies.success.errors import summarise_errors
+from playslot_rl.studies.success.page import success_page
+from playslot_rl.studies.success.summary import differences
+from playslot_rl.visualization.document import to_markdown
+
+ACTIONS = np.array([10.0, 30.0, 20.0, 20.0])
+"""Of each of four episodes."""
+CLONED = np.array([[2.0, 3.0, 4.0, 3.0], [2.5, 3.0, 4.5, 3.0]])
+"""Mean errors of the reference's two seeds, episode by episode."""
+
+
+def rows(method: str, errors: Any) -> list[dict[str, Any]]:
+    """A finished job for each seed, whose mean error is that of its actions."""
+    found = []
+    for seed, own in enumerate(np.asarray(errors)):
+        mean = float((own * ACTIONS).sum() / ACTIONS.sum())
+        values = {"mae": mean, "rmse": 2 * mean, "r2": 0.5}
+        found.append({
+            "name": f"{method}-d4-l2-s{seed}", "method": method, "title": METHODS[method].title, "protocol": "actions",
+            "demos": 4, "labels": 2, "world": 0, "seed": seed, "status": "done", "error": None, "labelled_demos": 2,
+            "success_rate": None, "outcomes": None, "episodes": len(own), "ci95": {"mae": None, "r2": None}, **values,
+            "references": {"constant": values, "previous": values},
+            "per_episode": {"rows": ACTIONS.tolist(), "mae": own.tolist(), "rmse": own.tolist()},
+            "agent_steps": None, "env_steps": None, "samples": None, "parameters": None, "pretraining": None,
+            "train_seconds": 1.0, "evaluation_seconds": 1.0,
+        })  # fmt: skip
+    return found
+
+
+def test_a_difference_is_that_of_the_errors_of_all_actions() -> None:
+    [found] = differences([*rows("playslot", CLONED), *rows("lapo", CLONED + 1)], "playslot")
+    assert (found["method"], found["protocol"], found["labels"], found["seeds"]) == ("lapo", "actions", 2, [0, 1])
+    assert found["difference"] == pytest.approx(1.0)
+    apart = (np.ones((1, 2, 4)) * ACTIONS * 4 / ACTIONS.sum()).reshape(1, 2, 4)
+    assert found["ci95"] == pytest.approx(hierarchical(apart))
+
+
+def test_episodes_that_are_hard_for_both_do_not_widen_it() -> None:
+    hard = np.array([[1.0, 9.0, 1.0, 9.0], [1.0, 9.0, 1.0, 9.0]])
+    own = summarise_errors(rows("lapo", hard + 0.5))[0]["ci95"]
+    [found] = differences([*rows("playslot", hard), *rows("lapo", hard + 0.5)], "playslot")
+    low, high = found["ci95"]
+    assert high - low < 0.2 * (own[1] - own[0])
+
+
+@pytest.mark.parametrize(("more", "better"), [(-1.0, True), (1.0, False), (np.array([1.0, -1, 1, -1]), None)])
+def test_the_lower_error_is_better(more: Any, better: bool | None) -> None:
+    [found] = differences([*rows("playslot", CLONED), *rows("lapo", CLONED + more)], "playslot")
+    assert found["better"] is better
+    assert found["leaves_out_0"] is (better is not None)
+
+
+def test_a_seed_that_one_of_them_lacks_makes_no_pair() -> None:
+    [found] = differences([*rows("playslot", CLONED), *rows("lapo", [CLONED[0] - 2])], "playslot")
+    assert found["seeds"] == [0]
+    assert found["difference"] == pytest.approx(-2.0)
+
+
+def test_the_page_says_which_side_is_better(tmp_path: Path) -> None:
+    jobs = [*rows("playslot", CLONED), *rows("lapo", CLONED - 1)]
+    result = {**comparison(tmp_path, []), "rows": jobs, "summary": summarise_errors(jobs), "labels": [2], "episodes": 4}
+    result |= {"measure": "actions", "held_out": 4, "differences": differences(jobs, "playslot")}
+    page = to_markdown(success_page(result))
+    assert "Error less that of PlaySlot (below 0 is better than PlaySlot, above 0 is worse), on pairs of the" in page
+    [line] = [line for line in page.splitlines() if line.startswith("| LAPO | **")]
+    assert line.split("|")[2].strip().startswith("**−1 (−")
+    assert "Points" not in page
