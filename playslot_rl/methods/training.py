@@ -53,14 +53,13 @@ def train(config: ExperimentConfig) -> StageCheckpoint:
     """Train `config.method` into `OUT/STAGE`; killed, the same command carries on; finished, it says so.
 
     Raises:
-        ConfigError: a method that acts, and a task without simulator, or blocks without dense reward.
+        ConfigError: what `check_method` refuses.
         CheckpointError: no finished parent, or `out` was begun otherwise.
         DataError: no videos, too few demonstrations, or none with actions.
         OutputError, TrainingError: see `playslot_rl.errors`.
     """
     method = METHODS[config.method]
-    if method.online:
-        require_online(config, getattr(config.baselines, method.name), method.name)
+    check_method(config, config.method)
     run, config = run_to_write(config), of_recorded(config)
     if method.model is None:
         return train_stage(method.last, config, run)

@@ -181,7 +181,6 @@ def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseM
 def model(record: StageRecord) -> Training:
     config, device = record.config, record.device
     own: LAPOConfig = config.baselines.lapo
-    own.check("baselines.lapo", config)
     with global_seed(config.seed, 0, record.name):
         inverse, forward = InverseModel(own, config.env.image_size).to(device), ForwardModel(own).to(device)
     return on_pairs(record, LAPOModelStage(inverse, forward, record.clips(2, shown=256), own.model), own.model)

@@ -213,7 +213,6 @@ class SOLDLearner:
 def training(record: StageRecord) -> OnlineTraining:
     config, slots = record.config, record.parents["slots"]
     own: SOLDConfig = config.baselines.sold
-    own.check("baselines.sold", config)
     before = prior_steps(own, slots)
     with global_seed(config.seed, 0, record.name):
         networks = build_networks(own, slots, config.env.action_dim, config.env.max_steps).to(record.device)
