@@ -52,7 +52,8 @@ class RunFacts:
         demos, labelled_demos: demonstrations whose videos, and whose real actions, the policy was trained on; None if
             the run does not say.
         fingerprints: weights by stage.
-        extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`).
+        extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`, which are
+            agent steps).
     """
 
     demos: int | None = None

@@ -163,7 +163,8 @@ def loss_chart(histories: Mapping[str, Sequence[Mapping[str, Any]]], theme: Them
 
 def learning_chart(curves: Mapping[str, Sequence[Mapping[str, Any]]], random: Mapping[str, Any], theme: Theme) -> bytes:
     """PNG of two panels, mean return with its standard error and success rate with its 95 % interval (where the task
-    measures any): points by method, and the random policy's. A ValueError where there is no point.
+    measures any): points by method over their agent steps (`env_steps` of `curve.json`), and the random policy's. A
+    ValueError where there is no point.
     """
     if not any(curves.values()):
         raise ValueError("learning_chart: got no points, expected at least one")

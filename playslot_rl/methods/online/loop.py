@@ -199,6 +199,7 @@ class _Run:
         self.write_curve()
 
     def write_curve(self) -> None:
+        """Write `curve.json`, whose `env_steps` are agent steps of `env.frame_skip` environment steps each."""
         seeds = self._development_seeds()
         values = {
             "method": METHODS[self.config.method].title,

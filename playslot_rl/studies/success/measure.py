@@ -45,9 +45,10 @@ def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str,
     """One row for each protocol of a job, finished or not; null where there is nothing to say.
 
     Of its keys, `outcomes` has a digit for each episode, 1 for a success, `commits` and `processors` are those that
-    trained and measured, `env_steps`  are `frame_skip` times the `agent_steps`, `samples` optimiser
-    steps times batch, `ci95` is Wilson's, `kept_rows` the share of the demonstrations' rows that trimming left, and
-    `curve` an online method's learning curve, with both kinds of steps.
+    trained and measured, `env_steps` are environment steps, `frame_skip` times the `agent_steps` (which `meta.json` and
+    `curve.json` of a run call `env_steps`), `samples` optimiser steps times batch, `ci95` is Wilson's, `kept_rows` the
+    share of the demonstrations' rows that trimming left, and `curve` an online method's learning curve, with both kinds
+    of steps.
     """
     done = status.status == "done"
     meta = json_or_nothing(job.run / job.stage / "checkpoint" / "meta.json") if done else {}
@@ -103,7 +104,8 @@ def own_model_seconds(job: SuccessJob) -> float:
 
 
 def learning_curve(job: SuccessJob, frame_skip: int) -> list[dict[str, Any]] | None:
-    """Rows of `RUN/METHOD/curve.json`, there before the job is done too; None without one."""
+    """Rows of `RUN/METHOD/curve.json`, whose `env_steps` are agent steps, with both kinds by their names; there before
+    the job is done, too; None without one."""
     rows = json_or_nothing(job.run / job.stage / "curve.json").get("rows") or []
     return [
         {**row, "agent_steps": row["env_steps"], "env_steps": row["env_steps"] * frame_skip} for row in rows
