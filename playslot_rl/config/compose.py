@@ -23,10 +23,12 @@ from playslot_rl.config.arguments import require_digits, require_folders, requir
 from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.families import preset_values
 from playslot_rl.config.machine import require_machine
+from playslot_rl.config.method_keys import read_alone, require_read
 from playslot_rl.config.methods import canonical_method
 from playslot_rl.config.plain import flatten, merged, multiplied, nearest, put, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
 from playslot_rl.config.roles import keys_of
+from playslot_rl.config.spelling import quoted, typed_value
 from playslot_rl.config.tasks import GROUP as TASKS_GROUP
 from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError, first_line
@@ -114,6 +116,7 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             if config.env.id and "env.action_dim" not in pairs:  # only the environment knows
                 config = dataclasses.replace(config, env=plugins.call(FITTED, config.env))
         require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
+        require_read(config, flatten(_typed(pairs)), command)
     except ConfigError:
         raise
     except ValueError as error:
@@ -204,11 +207,6 @@ def _short_keys(overrides: Sequence[str], command: str) -> list[str]:
     require_once([argument.partition("=")[0].strip().lstrip("+") for argument in hydra])
     inside = ",".join(quoted(argument) for argument in hydra)
     return [*kept, f"{group}.hydra=[{inside}]"] if hydra else kept
-
-
-def quoted(text: str) -> str:
-    """Text as Hydra's grammar reads it back unchanged."""
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
 def hint_of(key: str) -> Any:
@@ -355,7 +353,7 @@ def _views(run: Path) -> dict[str, str]:
     """How a run of recorded videos read them, as it would be typed; nothing of another task."""
     stored = stored_config(run)
     known = flatten(to_dict(stored)) if stored.env.name == "video" else {}
-    return {key: _text(known[key]) for key in VIEWED if key in known}
+    return {key: typed_value(known[key]) for key in VIEWED if key in known}
 
 
 def stored_config(run: Path, exported: bool = False) -> ExperimentConfig:
@@ -388,28 +386,18 @@ def stored_config(run: Path, exported: bool = False) -> ExperimentConfig:
 
 
 def spelled(config: ExperimentConfig, command: str) -> list[str]:
-    """The way back from `compose`: arguments with which `playslot COMMAND`, no comparison, gets exactly this config; a
-    ConfigError where none do: `run` is of another preset or task, and the command takes its config.
+    """The way back from `compose`: arguments with which `playslot COMMAND`, no comparison, gets this config in all that
+    it reads; a ConfigError where none do: `run` is of another preset or task, and the command takes its config.
     """
     continues = command in CONTINUES and config.run != "" and not is_pretrained(config.run)
     base = [] if continues else [*config.env.typed, f"preset={config.preset}"]
     base += [f"{key}={value}" for key, value in (("run", config.run), ("out", config.out)) if value]
-    known, wanted = flatten(to_dict(compose(base, command))), flatten(to_dict(config))
-    changed = [f"{key}={_text(value)}" for key, value in wanted.items() if known.get(key) != value]
+    known, wanted = flatten(to_dict(compose(base, command))), read_alone(config, command)
+    changed = [f"{key}={typed_value(value)}" for key, value in wanted.items() if known.get(key) != value]
     arguments = [*base, *(word for word in changed if not word.startswith(("preset=", "env.name=")))]
-    if compose(arguments, command) != config:
+    if read_alone(compose(arguments, command), command) != wanted:
         raise ConfigError(
             f"run={config.run}: got a run of another preset or task than {config.preset}, {config.env.name}, expected "
             f"the same with processes above 1 ({command} goes on from its config): use processes=1"
         )
     return arguments
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list | tuple):
-        return "[" + ",".join(quoted(part) if isinstance(part, str) else _text(part) for part in value) + "]"
-    return str(value)

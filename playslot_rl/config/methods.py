@@ -147,9 +147,9 @@ def method_stage(method: str) -> str:
     return METHODS[method].last.name
 
 
-def stage_title(stage: str) -> str:
-    """What a stage is, in words, where others build on it."""
-    return next(s.title for method in METHODS.values() for s in method.stages if s.name == stage)
+def stage_named(name: str) -> StageSpec:
+    """A stage of whatever method has it."""
+    return next(stage for method in METHODS.values() for stage in method.stages if stage.name == name)
 
 
 def require_method(key: str, name: str) -> None:

@@ -35,6 +35,7 @@ class StageSpec:
         settings: further ones that a finished one must share: those of its trainings, each of which compares its own
             when it is carried on.
         begun: further ones that only a half-finished one must share.
+        also: further ones that it reads, and that make no other training.
         parents: stages it is trained on.
         copies: its run has copies of them and is whole, instead of naming the run that they lie in.
         data: what it learns from: `videos`, `demos`, the `labelled` ones of these alone; empty learns by acting.
@@ -53,6 +54,7 @@ class StageSpec:
     keys: tuple[str, ...] = ()
     settings: tuple[str, ...] = ()
     begun: tuple[str, ...] = ()
+    also: tuple[str, ...] = ()
     parents: tuple[str, ...] = ()
     copies: bool = False
     data: Literal["videos", "demos", "labelled", ""] = "videos"
@@ -63,6 +65,12 @@ class StageSpec:
     stores: tuple[str, ...] = ()
     names: Mapping[str, str] = field(default_factory=dict)
     begun_names: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Keys and groups that it reads; where it reads a group's `steps`, also how often to look, said beside it. What
+        is typed for no stage that reads it is refused (`playslot_rl.config.method_keys`)."""
+        return (*self.keys, *self.settings, *self.begun, *self.also)
 
     @cached_property
     def groups(self) -> tuple[str, ...]:

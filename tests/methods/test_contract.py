@@ -6,18 +6,21 @@ not train it at once.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 from unittest.mock import patch
 
 import pytest
 import torch
 from stages import on_few_videos
 
-from playslot_rl.config import plugins
-from playslot_rl.config.compose import compose
+from playslot_rl.config import ExperimentConfig, plugins, to_dict
+from playslot_rl.config.compose import compose, hint_of
+from playslot_rl.config.method_keys import GROUPS, chosen
 from playslot_rl.config.methods import METHODS
+from playslot_rl.config.plain import flatten
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import CheckpointError, OutputError, TrainingError
 from playslot_rl.methods.online.replay import OnlineCheckpoints
@@ -86,17 +89,20 @@ def _few_videos() -> Iterator[None]:
         yield
 
 
+def shared(out: Path, world: Path) -> list[str]:
+    return [
+        "preset=smoke", "env=button_press", "data.root=videos", "device=cpu", "logging.backend=none",
+        f"data.cache={world.parent / 'cache'}", f"out={out}",
+    ]  # fmt: skip
+
+
 def train(case: Case, out: Path, world: Path, *more: str) -> None:
     """Train a stage, and what it builds on, by its command."""
-    shared = [
-        "preset=smoke", "env=button_press", "data.root=videos", "device=cpu", "logging.backend=none",
-        f"data.cache={world.parent / 'cache'}", f"out={out}", *more,
-    ]  # fmt: skip
-    name = case.spec.name
+    name, arguments = case.spec.name, [*shared(out, world), *more]
     if name in WORLD:
-        WORLD[name].main(compose([*shared, *([] if name == "slots" else [f"run={world}"])]))
+        WORLD[name].main(compose([*arguments, *([] if name == "slots" else [f"run={world}"])]))
     else:
-        train_baseline.main(compose([*shared, f"method={case.method}", f"run={world}"]))
+        train_baseline.main(compose([*arguments, f"method={case.method}", f"run={world}"]))
 
 
 @pytest.fixture(scope="module")
@@ -209,3 +215,47 @@ def test_a_finished_run_is_loaded_as_what_the_method_says(name: str, runs: dict[
     for reference in filter(None, (method.load.actor, method.load.video)):
         loaded = plugins.call(reference, run, "cpu")
         assert callable(getattr(loaded, "predict" if reference == method.load.video else "reset"))
+
+
+def with_value(config: Any, key: str, value: object) -> Any:
+    """A config, or a group of one, with another value of a dotted key."""
+    first, _, rest = key.partition(".")
+    return replace(config, **{first: with_value(getattr(config, first), rest, value) if rest else value})
+
+
+def with_others_changed(config: ExperimentConfig) -> tuple[ExperimentConfig, set[str]]:
+    """A config in which choices, flags and numbers that its method does not read are others, and which these are."""
+    methods, changed = chosen(config, "train-baseline"), set[str]()
+    assert methods is not None
+    for key, value in flatten(to_dict(config)).items():
+        if key.partition(".")[0] in GROUPS and not methods.reads(key) and (others := other_values(key, value)):
+            with suppress(ValueError):  # it does not go with the others
+                config = with_value(config, key, others[0])
+                changed.add(key)
+    return config, changed
+
+
+def other_values(key: str, value: object) -> list[object]:
+    match value:
+        case bool():
+            return [not value]
+        case int():
+            return [value + 1]
+        case float():
+            return [value / 2]
+    return [other for other in get_args(hint_of(key)) if isinstance(other, str) and other != value]
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "playslot"])
+def test_what_a_method_does_not_read_changes_nothing(name: str, runs: dict[str, Path], tmp_path: Path) -> None:
+    method, plain, out = METHODS[name], tmp_path / "plain", tmp_path / "others"
+    run, world = trained(method.last.name, runs), runs["folder"] / "world"
+    if CASES[method.last.name].method != name:
+        train(Case(name, method.last), plain, world)
+        run = plain
+    config, changed = with_others_changed(compose([*shared(out, world), f"method={name}", f"run={world}"]))
+    assert {"model.savi.slot_dim", "slots.steps", "dynamics.steps", "dynamics.optim.lr"} & changed
+    assert {"slots.precision", "dynamics.precision"} <= changed
+    assert len(changed) > 200
+    train_baseline.main(config)
+    assert Run(out).own(method.last.name).fingerprint == Run(run).own(method.last.name).fingerprint

@@ -75,6 +75,7 @@ def mine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         f"collect {SMOKE} policy=expert episodes=4 out=demos",
         f"{trained} out=run",
         f"{trained} behaviour.loss=l2 out=run",
+        f"{trained} behaviour.labelled_demos=3 out=few",
         "evaluate run=run episodes=2",
         f"train-baseline {SMOKE} method=resnet_oracle data.demos=demos out=other",
         f"collect {dot} policy=expert episodes=4 out=dots/demos",
@@ -92,6 +93,7 @@ def test_a_method_of_a_package_is_trained_and_evaluated(mine: tuple[Path, str]) 
     site, said = mine
     assert "out=run: 0" in said, said
     assert "behaviour.loss: got l2, expected l1" in said, said
+    assert "behaviour.labelled_demos: got 3 with method=mine, which does not read it, expected demos=" in said, said
     stored = json.loads((site / "run" / "mine" / "checkpoint" / "config.json").read_text())
     assert stored["mine"]["width"] == 3
     assert (site / "run" / "evaluation" / "simulation" / "eval_info.json").is_file(), said

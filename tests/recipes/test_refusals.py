@@ -23,6 +23,15 @@ MISTYPED = [
     ("train-slots out={new} data.root={videos} data.cache_limit=lots", r"data\.cache_limit"),
     ("train-slots out={new} data.root={videos} data.workers=-1", r"data\.workers"),
     ("train-slots out={new} data.root={videos} data.shuffle_buffer=0", r"data\.shuffle_buffer"),
+    # methods
+    (
+        "train-baseline method=resnet_bc out={new} data.demos={demos} behaviour.labelled_demos=10",
+        "behaviour.labelled_demos: got 10 with method=resnet_bc, which does not read it, expected demos=",
+    ),
+    (
+        "compare methods=resnet_bc,act labels=2 out={new} dynamics.steps=10",
+        "dynamics.steps: got 10 with methods=resnet_bc,act, which do not read it, expected baselines.resnet_oracle.st",
+    ),
     # plan
     ("plan run={run} planner=icem", r"plan\.planner: got 'icem', expected one of cem, mppi, gradient, prototypes"),
     ("plan run={run} proposal=oracle", r"plan\.proposal: got 'oracle', expected one of none, policy"),
@@ -54,6 +63,22 @@ REFUSED = [
     ("train-slots out={new} data.root={videos} device=meta", "device=meta: .*use device=cpu"),
     ("train-slots out={new} data.root={videos} device=cuda:99", "device=cuda:99: .*use device=cpu"),
     ("train-slots out={new} data.root={videos} device=cpu:x", "device=cpu:x: .*use device=cpu"),
+    # what a method checks itself
+    ("train-baseline method=act out={new} baselines.act.weights=none.pt", "act.weights: got none.pt, expected a file"),
+    (
+        "train-baseline method=history_bc out={new} baselines.resnet_oracle.weights=none.pt",
+        r"baselines\.resnet_oracle\.weights: got none\.pt, expected a file",
+    ),
+    (
+        "train-baseline method=lapo out={new} baselines.lapo.forward_channels=[4,4,4,4,4,4,4]",
+        r"baselines\.lapo\.forward_channels: got 7 widths, each of which halves frames of env\.image_size=64",
+    ),
+    ("train-baseline method=svg out={new} env.image_size=48", "env.image_size: got 48.* or leave out method svg"),
+    ("train-baseline method=caddy_policy out={new} baselines.caddy.perceptual=none.pth", "perceptual.*none.pth"),
+    (
+        "train-baseline method=sold run={run} out={new} baselines.sold.sequence=99 baselines.sold.context=20",
+        r"baselines\.sold\.context: got 20, expected at most",
+    ),
     # data sets
     ("train-slots out={new} data.root={missing}", "no such folder, expected a LeRobot data set"),
     ("train-dynamics run={slots} data.root={foreign}", "got no meta/info.json, expected a LeRobot v3.0 data set"),

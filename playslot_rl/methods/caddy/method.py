@@ -145,6 +145,7 @@ POLICY: Final = StageSpec(
     parents=("caddy",),
     data="demos",
     parts="playslot_rl.methods.caddy.behaviour:policy",
+    also=("behaviour.policy_from",),
     sizes="playslot_rl.methods.cloning:sizes",
     begun_names={
         "behaviour.trim_pixels": "trim_pixels",

@@ -81,6 +81,7 @@ POLICY: Final = StageSpec(
     parents=("laom_model",),
     data="demos",
     parts="playslot_rl.methods.laom.training:policy",
+    also=("behaviour.policy_from",),
     sizes="playslot_rl.methods.cloning:sizes",
 )  # fmt: skip
 LAOM: Final = Method(

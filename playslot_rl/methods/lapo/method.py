@@ -139,6 +139,7 @@ POLICY: Final = StageSpec(
     parents=("lapo_model",),
     data="demos",
     parts="playslot_rl.methods.lapo.training:policy",
+    also=("behaviour.policy_from",),
     sizes="playslot_rl.methods.cloning:sizes",
     begun_names={
         "model.action_decoder": "action_decoder",

@@ -43,6 +43,7 @@ POLICY: Final = StageSpec(
     parents=("slots", MODEL.name),
     data="demos",
     parts=f"{_PARTS}:policy",
+    also=("behaviour.policy_from",),
     sizes="playslot_rl.methods.cloning:sizes",
 )  # fmt: skip
 LAPO_SLOTS: Final = Method(

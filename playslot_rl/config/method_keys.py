@@ -1,0 +1,150 @@
+"""Which keys the methods that a command trains read: what is typed for others alone changes nothing, and is refused.
+
+A stage declares its keys once (`StageSpec.reads`), a method its own group (`Method.config`). They are judged in the
+groups that methods share, and in what says which demonstrations they learn from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+from playslot_rl.config.compare_video import method_of
+from playslot_rl.config.experiment import ExperimentConfig
+from playslot_rl.config.methods import METHODS, Method, stage_named
+from playslot_rl.config.plain import flatten, to_dict
+from playslot_rl.config.roles import keys_of
+from playslot_rl.config.spelling import typed_value
+from playslot_rl.config.stage_spec import BASELINES, StageSpec
+from playslot_rl.errors import ConfigError
+
+GROUPS: Final = ("model", "slots", "dynamics", "behaviour", BASELINES.rstrip("."))
+DEMOS: Final = ("demos", "data.draw", "compare.demos")
+"""What says which demonstrations there are to learn from."""
+LABELLED: Final = "behaviour.labelled_demos"
+LABELS: Final = "compare.labels"
+WORLD: Final = ("slots", "dynamics")
+MOST: Final = 3
+"""Keys that a message names instead of one, at most."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The methods of a command.
+
+    Attributes:
+        command: of `playslot`.
+        config: its config.
+        methods: as they are trained.
+        trained: their stages that the command trains.
+        found: those of a world model that is there.
+    """
+
+    command: str
+    config: ExperimentConfig
+    methods: tuple[Method, ...]
+    trained: tuple[StageSpec, ...]
+    found: tuple[StageSpec, ...] = ()
+
+    def reads(self, key: str) -> bool:
+        """Whether one of the methods reads a key, by its dotted name; true of keys that are not the methods' affair."""
+        if key in DEMOS:
+            return any(stage.data in ("demos", "labelled") for stage in self.trained)
+        if key == LABELS:
+            return any(method.decodes or method.labelled_only for method in self.methods)
+        if key == LABELLED and self.command == "compare" and self.config.compare.labels:
+            return False
+        if key.partition(".")[0] not in GROUPS or _within(key, self._own):
+            return True
+        beside = f"{key.rpartition('.')[0]}.steps"  # whoever trains for so many steps looks as often as is said there
+        named = beside if key in keys_of(ExperimentConfig, "free") else key
+        return any(_within(one, self._declared) and not _within(one, self._given) for one in (key, named))
+
+    def instead(self, key: str) -> str:
+        """What to type, as the end of a message."""
+        if key == LABELLED and self.reads("demos"):
+            labels = self.command == "compare" and self.reads(LABELS)
+            return f"expected {'labels' if labels else 'demos'}=, how many demonstrations with actions are learned from"
+        if _within(key, self._given):
+            return "expected none: it is of the world model that run= names"
+        own = key.removeprefix(BASELINES).split(".")
+        for first in range(1, len(own)):
+            alike = [one for one in self._keys if one.endswith("." + ".".join(own[first:]))]
+            if 0 < len(alike) <= MOST:
+                return f"expected {' or '.join(f'{one}=' for one in alike)}"
+        return "expected none: leave it out"
+
+    @property
+    def said(self) -> str:
+        """The methods as they are typed, and that they do not read a key."""
+        if self.command == "train-baseline":
+            return f"method={self.config.method}, which does not read it"
+        names = self.config.compare.methods if self.command == "compare" else self.config.compare_video.methods
+        return f"methods={','.join(names)}, which {'do' if len(names) > 1 else 'does'} not read it"
+
+    @cached_property
+    def _own(self) -> tuple[str, ...]:
+        return tuple(f"{BASELINES}{method.name}" for method in self.methods if method.config is not None)
+
+    @cached_property
+    def _declared(self) -> tuple[str, ...]:
+        return tuple(key for stage in self.trained for key in stage.reads)
+
+    @cached_property
+    def _given(self) -> tuple[str, ...]:
+        return tuple(key for stage in self.found for key in (*stage.keys, *stage.settings))
+
+    @cached_property
+    def _keys(self) -> tuple[str, ...]:
+        """The keys of the methods' groups that are read."""
+        known = flatten(to_dict(self.config))
+        return tuple(key for key in known if key.partition(".")[0] in GROUPS and self.reads(key))
+
+
+def _within(key: str, names: Iterable[str]) -> bool:
+    """Whether a key is one of some keys, or in one of some groups."""
+    return any(f"{key}.".startswith(f"{name}.") for name in names)
+
+
+def chosen(config: ExperimentConfig, command: str) -> Chosen | None:
+    """The methods that a command trains; None for commands that have no choice."""
+    if command == "train-baseline":
+        method = METHODS[config.method]
+        found = tuple(stage_named(name) for name in WORLD if name in method.last.parents)
+        return Chosen(command, config, (method,), _stages(method), found)
+    if command == "compare":
+        methods = tuple(METHODS[name] for name in config.compare.methods)
+        trained = tuple(stage for method in methods for stage in _stages(method))
+        runs = [part for part in (config.run, *config.compare.runs.split(",")) if part.strip()]
+        world, made = [*WORLD], len(runs) < config.compare.worlds
+    elif command == "compare-video":
+        methods = tuple(map(method_of, config.compare_video.methods))
+        trained = tuple(stage_named("dynamics") if method.imagines else method.last for method in methods)
+        world, made = ["slots"], not config.run
+    else:
+        return None
+    parents = tuple(map(stage_named, world)) if any(method.slots for method in methods) else ()
+    return Chosen(command, config, methods, (*trained, *parents) if made else trained, () if made else parents)
+
+
+def _stages(method: Method) -> tuple[StageSpec, ...]:
+    """Those that a method trains beside a world model."""
+    return (method.last,) if method.model is None else (method.model, method.last)
+
+
+def require_read(config: ExperimentConfig, typed: Mapping[str, Any], command: str) -> None:
+    """Refuse what was typed, by dotted names, that no method of the command reads, by a ConfigError."""
+    methods = chosen(config, command)
+    for key, value in typed.items():
+        if methods is not None and not methods.reads(key):
+            name, text = key.removeprefix("compare."), typed_value(value)
+            got = text.strip("[]") if name in ("demos", "labels") else text
+            raise ConfigError(f"{name}: got {got} with {methods.said}, {methods.instead(key)}")
+
+
+def read_alone(config: ExperimentConfig, command: str) -> dict[str, Any]:
+    """A config as plain values by dotted names, without those that no method of the command reads."""
+    methods, values = chosen(config, command), flatten(to_dict(config))
+    return {key: value for key, value in values.items() if methods is None or methods.reads(key)}
