@@ -15,6 +15,7 @@ import pytest
 
 from playslot_rl.config import CompareConfig, ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose, spelled
+from playslot_rl.config.method_keys import read_alone
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.studies import launch
@@ -33,8 +34,8 @@ def test_every_job_of_a_comparison_is_spelled_as_arguments_that_make_it(tmp_path
     assert config.compare.processes == 2
     plain = replace(config, compare=CompareConfig(evaluation_seed=3, processes=2))
     for job in success_jobs(config, tmp_path):
-        own = success_config(plain, job, "pretrained/block_push_easy")
-        assert compose(spelled(own, "train-baseline"), "train-baseline") == own
+        own, command = success_config(plain, job, "pretrained/block_push_easy"), "train-baseline"
+        assert read_alone(compose(spelled(own, command), command), command) == read_alone(own, command)
 
 
 @pytest.mark.parametrize("method", ["svg", "playslot_m"])
@@ -43,7 +44,7 @@ def test_every_job_of_a_video_comparison_is_spelled_as_arguments_that_make_it(me
     job = VideoJob(method, 1, tmp_path / "out", "")  # type: ignore[arg-type]
     own = video_config(config, job, "pretrained/block_push_easy")
     command = "train-dynamics" if job.trained_as == "playslot" else "train-baseline"
-    assert compose(spelled(own, command), command) == own
+    assert read_alone(compose(spelled(own, command), command), command) == read_alone(own, command)
     assert video_record(job, own, {}, lpips=False)["processes"] == 3
 
 
