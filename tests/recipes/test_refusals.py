@@ -73,11 +73,11 @@ REFUSED = [
         "train-baseline method=lapo out={new} baselines.lapo.forward_channels=[4,4,4,4,4,4,4]",
         r"baselines\.lapo\.forward_channels: got 7 widths, each of which halves frames of env\.image_size=64",
     ),
-    ("train-baseline method=svg out={new} env.image_size=48", "env.image_size: got 48.* or leave out method svg"),
+    ("train-baseline method=svg out={new} env.image_size=32", "env.image_size: got 32, expected 64.*method svg"),
     ("train-baseline method=caddy_policy out={new} baselines.caddy.perceptual=none.pth", "perceptual.*none.pth"),
     (
-        "train-baseline method=sold run={run} out={new} baselines.sold.sequence=99 baselines.sold.context=20",
-        r"baselines\.sold\.context: got 20, expected at most",
+        "train-baseline method=sold run={run} out={new} baselines.sold.sequence=99 baselines.sold.context=30",
+        r"baselines\.sold\.context: got 30, expected at most",
     ),
     # data sets
     ("train-slots out={new} data.root={missing}", "no such folder, expected a LeRobot data set"),

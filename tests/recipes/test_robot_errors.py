@@ -131,7 +131,13 @@ def test_methods_are_compared_without_a_simulator(kept: tuple[Path, Path], tmp_p
     table = [line for line in done.out.splitlines() if line.startswith("|")]
     assert [word.strip() for word in table[0].split("|")] == ["", "error of actions", "2 labelled", "3 labelled", ""]
     names = ["Slot BC", "ResNet BC", "PlaySlot", "(mean labelled action)", "(action of the step before)"]
-    assert [line.split("|")[1].strip() for line in table[2:]] == names
+    assert [line.split("|")[1].strip() for line in table[2:7]] == names
+    assert [line.split("|")[1].strip() for line in table[7:]] == ["less PlaySlot", "---", "Slot BC", "ResNet BC"]
+    apart = {(row["method"], row["labels"]): row for row in result["differences"]}
+    assert apart.keys() == rows.keys() - {("playslot", 2), ("playslot", 3)}
+    for (method, labels), row in apart.items():
+        assert row["difference"] == pytest.approx(rows[method, labels]["mae"] - rows["playslot", labels]["mae"])
+        assert row["better"] in (None, row["difference"] < 0)
     assert f"{rows['resnet_bc', 3]['mae']:.3g} (" in table[3]
     started.clear()
     assert smoke(*command).out.count("done before, skipped") == 6
