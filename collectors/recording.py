@@ -1,126 +1,36 @@
-"""Hands episodes out to workers, and replaces workers that die or hang.
-
-Each worker process records the episodes it is given and writes their files itself, so that only small messages pass:
-nothing waits for the parent, and a process that stops in the middle of an episode cannot block it.
-"""
+"""Records the episodes of a collection: in this process, or by workers beside it."""
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import ForkServerProcess
-from typing import TYPE_CHECKING, Any
+from functools import partial
 
 import numpy as np
-import torch
 
 from playslot_rl.collectors.episodes import EpisodeCollector, record
-from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
+from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode, encode
+from playslot_rl.collectors.workers import Call, Workers
 from playslot_rl.config import CollectorConfig
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.envs.rendering import check_rendering
-from playslot_rl.errors import PlaySlotError
-from playslot_rl.runtime.processes import begin_worker, worker_context
-
-if TYPE_CHECKING:
-    from playslot_rl.collectors.ray_workers import RayWorkers
+from playslot_rl.storage.atomic import write_bytes
 
 AHEAD = 2  # episodes in a worker's hands: while it records one, the next is there already
-POLL_S = 1.0
-START_S = 300.0  # what a worker is given to import everything, beyond `collector.timeout_s`
 CLIPS_AT_ONCE = 64
 
 
-@dataclass(frozen=True)
-class Report:
-    """News of a worker: it stored episode `index`; or ended with an `error`; or died, and of what; else it is ready."""
-
-    slot: int
-    index: int | None = None
-    error: Exception | None = None
-    dead: str = ""
+def storing(journal: Journal) -> Callable[[int], None]:
+    """In a worker of this machine: records an episode and writes its file itself, so that only small messages pass."""
+    collector = EpisodeCollector(journal.spec)
+    return lambda index: journal.add(collector.record(index))
 
 
-def serve(pipe: Connection[Any, Any], journal: Journal) -> None:
-    """Body of a worker process: record and store what comes through the pipe, until it closes."""
-    begin_worker()
-    torch.set_num_threads(1)
-    try:
-        collector = EpisodeCollector(journal.spec)
-        pipe.send(None)  # ready
-        while True:
-            index: int = pipe.recv()
-            journal.add(collector.record(index))
-            pipe.send(index)
-    except (EOFError, ConnectionError):
-        return
-    except Exception as error:  # noqa: BLE001  told to the parent, which ends with it
-        with contextlib.suppress(ConnectionError):
-            pipe.send(error if isinstance(error, PlaySlotError) else RuntimeError(f"{type(error).__name__}: {error}"))
-
-
-class LocalWorkers:
-    """Worker processes, each in a place (slot) where episodes are recorded."""
-
-    def __init__(self, journal: Journal, count: int) -> None:
-        self.journal = journal
-        self._context = worker_context()
-        self._workers: list[tuple[ForkServerProcess, Connection[Any, Any]] | None] = [None] * count
-
-    def start(self, slot: int) -> None:
-        """Start the worker of a place, empty or left by a dead one."""
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=serve, args=(theirs, self.journal), daemon=True)
-        process.start()
-        theirs.close()
-        self._workers[slot] = process, ours
-
-    def submit(self, slot: int, index: int) -> None:
-        """Hand an episode to a worker, which records its episodes in the order they come."""
-        worker = self._workers[slot]
-        assert worker is not None
-        with contextlib.suppress(ConnectionError):  # `reports` says that it died
-            worker[1].send(index)
-
-    def reports(self, timeout: float) -> list[Report]:
-        """What the workers say; empty after `timeout` seconds of silence."""
-        ready = wait([worker[1] for worker in self._workers if worker is not None], timeout)
-        there = [(slot, *worker) for slot, worker in enumerate(self._workers) if worker is not None]
-        return [report for slot, process, pipe in there if pipe in ready for report in self._read(slot, process, pipe)]
-
-    def _read(self, slot: int, process: ForkServerProcess, pipe: Connection[Any, Any]) -> Iterator[Report]:
-        try:
-            while pipe.poll():
-                said = pipe.recv()
-                yield Report(slot, error=said) if isinstance(said, Exception) else Report(slot, index=said)
-        except (EOFError, OSError):
-            process.join(1.0)
-            code = process.exitcode
-            self.kill(slot)
-            ending = f"exit code {code}"
-            if code is not None and code < 0:
-                with contextlib.suppress(ValueError):
-                    ending = signal.Signals(-code).name
-            yield Report(slot, dead=f"ended with {ending}")
-
-    def kill(self, slot: int) -> None:
-        """End a worker at once, also one that hangs."""
-        worker, self._workers[slot] = self._workers[slot], None
-        if worker is not None:
-            worker[1].close()
-            worker[0].kill()  # SIGKILL: also ends one that is stopped
-            worker[0].join()
-
-    def close(self) -> None:
-        """End all. Episodes in hand are lost: a file is whole or not there, so nothing else is."""
-        for slot in range(len(self._workers)):
-            self.kill(slot)
+def encoding(spec: CollectionSpec) -> Callable[[int], bytes]:
+    """On a machine of a cluster, which needs a GL backend and no shared disk: an episode encoded, to be stored here."""
+    collector = EpisodeCollector(spec)
+    return lambda index: encode(collector.record(index))
 
 
 def record_into(
@@ -152,18 +62,33 @@ def record_into(
             journal.add(episode)
             yield episode.index
         return
-    pool: LocalWorkers | RayWorkers
-    if settings.backend == "ray":
-        from playslot_rl.collectors.ray_workers import RayWorkers
-
-        pool = RayWorkers(journal, workers, settings.ray_address)
-    else:
+    if settings.backend == "local":
         check_rendering()  # a missing GL backend is one line here, many in the workers
-        pool = LocalWorkers(journal, workers)
+
+    def replaced(reason: str, calls: Sequence[Call]) -> None:
+        names = ", ".join(str(index) for (index,) in calls)
+        say(f"a worker {reason}: another takes its place (episodes in hand: {names or 'none'})")
+
+    make = partial(storing, journal) if settings.backend == "local" else partial(encoding, journal.spec)
+    pool = Workers(make, workers, settings, replaced)
     try:
-        yield from _Dispatch(pool, journal, indices, workers, settings, say).run()
+        for index, content in _recorded(pool, deque(sorted(set(indices)))):
+            if content is not None:
+                write_bytes(journal.path(index), content)
+            yield index
     finally:
         pool.close()
+
+
+def _recorded(pool: Workers, waiting: deque[int]) -> Iterator[tuple[int, bytes | None]]:
+    while waiting or pool.busy:
+        # The last episodes go to whoever is free, not on top of another.
+        for depth in range(AHEAD if len(waiting) > len(pool) else 1):
+            for number in range(len(pool)):
+                if waiting and pool.in_hand(number) <= depth:
+                    pool.submit(number, waiting.popleft())
+        for (index,), content in pool.answers():
+            yield index, content
 
 
 def draw(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpisode]:
@@ -186,83 +111,3 @@ def draw(spec: CollectionSpec, indices: Sequence[int]) -> Iterator[RecordedEpiso
                 rewards=np.zeros(spec.steps, np.float32),
                 success=np.zeros(spec.steps, np.bool_),
             )
-
-
-class _Dispatch:
-    """Which episodes wait, which are in whose hands, and for how long each worker has been silent."""
-
-    def __init__(
-        self,
-        pool: LocalWorkers | RayWorkers,
-        journal: Journal,
-        indices: Sequence[int],
-        workers: int,
-        settings: CollectorConfig,
-        say: Callable[[str], None],
-    ) -> None:
-        self.pool, self.journal, self.settings, self.say = pool, journal, settings, say
-        self.waiting = deque(sorted(set(indices)))
-        self.in_hand: list[list[int]] = [[] for _ in range(workers)]
-        self.silent_s = [0.0] * workers
-        self.started = [False] * workers
-        self.replaced = 0
-
-    def run(self) -> Iterator[int]:
-        for slot in range(len(self.in_hand)):
-            self.pool.start(slot)
-        while self.waiting or any(self.in_hand):
-            self._hand_out()
-            begin = time.monotonic()
-            reports = self.pool.reports(POLL_S)
-            # Time in which this process was itself stopped, or busy with the caller's work, is nobody's silence.
-            waited = min(time.monotonic() - begin, 2 * POLL_S)
-            for slot, held in enumerate(self.in_hand):
-                self.silent_s[slot] += waited if held else 0.0
-            for report in reports:
-                index = self._take(report)
-                if index is not None:
-                    yield index
-            self._replace_silent()
-
-    def _hand_out(self) -> None:
-        # The last episodes go to whoever is free, not on top of another.
-        ahead = AHEAD if len(self.waiting) > len(self.in_hand) else 1
-        for depth in range(ahead):
-            for slot, held in enumerate(self.in_hand):
-                if len(held) <= depth and self.waiting:
-                    index = self.waiting.popleft()
-                    held.append(index)
-                    self.pool.submit(slot, index)
-
-    def _take(self, report: Report) -> int | None:
-        """A report's episode, if it stored one."""
-        self.silent_s[report.slot], self.started[report.slot] = 0.0, True
-        if report.error is not None:
-            raise report.error
-        if report.dead:
-            self._replace(report.slot, report.dead)
-        if report.index is None:
-            return None
-        self.in_hand[report.slot].remove(report.index)
-        return report.index
-
-    def _replace_silent(self) -> None:
-        for slot, silent in enumerate(self.silent_s):
-            if silent >= self.settings.timeout_s + (0.0 if self.started[slot] else START_S):
-                self.pool.kill(slot)
-                self._replace(slot, f"gave no episode for {self.settings.timeout_s:g} s")
-
-    def _replace(self, slot: int, reason: str) -> None:
-        """Start another worker in a dead one's place; its episodes wait again."""
-        lost = sorted(self.in_hand[slot])
-        self.waiting.extendleft(reversed(lost))
-        self.in_hand[slot], self.silent_s[slot], self.started[slot] = [], 0.0, False
-        if self.replaced >= self.settings.restarts:
-            raise PlaySlotError(
-                f"a collector worker {reason}, after {self.replaced} were replaced: got more than collector.restarts="
-                f"{self.settings.restarts}, expected workers that live; the same command carries on"
-            )
-        self.replaced += 1
-        names = ", ".join(map(str, lost))
-        self.say(f"a worker {reason}: another takes its place (episodes in hand: {names or 'none'})")
-        self.pool.start(slot)

@@ -9,6 +9,8 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +18,9 @@ import pytest
 from small_sets import assert_whole, begin, small, spec_of
 from tiny_disk import tiny_disk
 
-from playslot_rl.collectors import recording
+from playslot_rl.collectors import recording, workers
 from playslot_rl.collectors.journal import Journal
-from playslot_rl.collectors.recording import Report, record_into
+from playslot_rl.collectors.recording import record_into
 from playslot_rl.config import CollectorConfig
 from playslot_rl.errors import ConfigError, OutputError, PlaySlotError
 
@@ -27,100 +29,84 @@ pytestmark = pytest.mark.integration
 # --- handing out, with workers that are not processes ----------------------------------------------------------------
 
 
-class ScriptedWorkers:
-    """Workers that store made-up content at once, but for the faults they are told of."""
+class Script:
+    """What made-up workers do: each episode is stored at once, but for the faults that are left."""
 
-    def __init__(self, journal: Journal, count: int, dies: dict[int, int], hangs: dict[int, int]) -> None:
-        self.journal, self.dies, self.hangs = journal, dies, hangs
-        self.queues: list[list[int]] = [[] for _ in range(count)]
-        self.alive = [False] * count
+    def __init__(self, dies: dict[int, int], hangs: dict[int, int]) -> None:
+        self.dies, self.hangs = dies, hangs
         self.recorded: list[int] = []
-        self.killed: list[int] = []
-        self.starts = 0
+        self.started: list[ScriptedWorker] = []
 
-    def start(self, slot: int) -> None:
-        assert not self.alive[slot]
-        self.alive[slot], self.queues[slot] = True, []
-        self.starts += 1
 
-    def submit(self, slot: int, index: int) -> None:
-        assert self.alive[slot]
-        self.queues[slot].append(index)
+class ScriptedWorker:
+    """A worker that is no process: it answers as soon as it is asked, or never, or with the error of a dead one."""
 
-    def reports(self, timeout: float) -> list[Report]:
-        found = []
-        for slot, queue in enumerate(self.queues):
-            if not queue or not self.alive[slot]:
-                continue
-            index = queue[0]
-            if self.hangs.get(index, 0):
-                continue
-            if self.dies.get(index, 0):
-                self.dies[index] -= 1
-                self.alive[slot] = False
-                found.append(Report(slot, dead="ended with SIGKILL"))
-                continue
-            self.recorded.append(queue.pop(0))
-            found.append(Report(slot, index=index))
-        return found
+    def __init__(self, script: Script) -> None:
+        self.script, self.alive, self.ready = script, True, Future[Any]()
+        self.dead = self.stuck = False
+        self.ready.set_result(None)
+        script.started.append(self)
 
-    def kill(self, slot: int) -> None:
-        self.killed.append(slot)
-        self.alive[slot] = False
-        if self.queues[slot]:
-            self.hangs[self.queues[slot][0]] -= 1
+    def submit(self, asked: tuple[int]) -> Future[Any]:
+        answer, (index,) = Future[Any](), asked
+        if not (self.dead or self.stuck):
+            self.dead, self.stuck = (bool(faults.get(index)) for faults in (self.script.dies, self.script.hangs))
+            for faults in (self.script.dies, self.script.hangs):
+                faults[index] = max(0, faults.get(index, 0) - 1)
+        if self.dead:
+            answer.set_exception(BrokenProcessPool())
+        elif not self.stuck:
+            self.script.recorded.append(index)
+            answer.set_result(None)
+        return answer
+
+    def lost(self, error: Exception) -> str:
+        assert isinstance(error, BrokenProcessPool)
+        return "ended with SIGKILL"
 
     def close(self) -> None:
-        self.alive = [False] * len(self.alive)
+        self.alive = False
 
 
 def run_scripted(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    settings: CollectorConfig,
-    episodes: int = 9,
-    **faults: dict[int, int],
-) -> tuple[list[int], ScriptedWorkers, list[str]]:
-    pools: list[ScriptedWorkers] = []
-
-    def make(journal: Journal, count: int) -> ScriptedWorkers:
-        pools.append(ScriptedWorkers(journal, count, faults.get("dies", {}), faults.get("hangs", {})))
-        return pools[-1]
-
-    monkeypatch.setattr(recording, "LocalWorkers", make)
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: CollectorConfig, **faults: dict[int, int]
+) -> tuple[list[int], Script, list[str]]:
+    script = Script(faults.get("dies", {}), faults.get("hangs", {}))
+    monkeypatch.setattr(workers, "LocalWorker", lambda make: ScriptedWorker(script))
+    monkeypatch.setattr(workers, "POLL_S", 0.01)
     monkeypatch.setattr(recording, "check_rendering", lambda: None)
-    monkeypatch.setattr(recording, "START_S", 0.0)
     said: list[str] = []
     journal = Journal(tmp_path / "journal", spec_of(9))
     try:
         found = list(record_into(journal, range(9), 3, settings, said.append))
     finally:
-        assert not any(pools[0].alive)
-    return found, pools[0], said
+        assert not any(worker.alive for worker in script.started)
+    return found, script, said
 
 
 def test_each_episode_is_handed_out_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found, pool, said = run_scripted(tmp_path, monkeypatch, CollectorConfig())
-    assert sorted(found) == sorted(pool.recorded) == list(range(9))
-    assert (pool.starts, said) == (3, [])
+    found, script, said = run_scripted(tmp_path, monkeypatch, CollectorConfig())
+    assert sorted(found) == sorted(script.recorded) == list(range(9))
+    assert (len(script.started), said) == (3, [])
 
 
 def test_dead_workers_are_replaced_and_their_episodes_recorded_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found, pool, said = run_scripted(tmp_path, monkeypatch, CollectorConfig(restarts=3), dies={1: 2, 8: 1})
-    assert sorted(found) == sorted(pool.recorded) == list(range(9))
-    assert pool.starts == 3 + 3
+    found, script, said = run_scripted(tmp_path, monkeypatch, CollectorConfig(restarts=3), dies={1: 2, 8: 1})
+    assert sorted(found) == sorted(script.recorded) == list(range(9))
+    assert len(script.started) == 3 + 3
     assert len(said) == 3
     assert "SIGKILL" in said[0]
+    assert "episodes in hand: 1" in said[0]
 
 
 def test_a_worker_that_hangs_is_killed_and_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = CollectorConfig(timeout_s=1e-4, restarts=2)
-    found, pool, said = run_scripted(tmp_path, monkeypatch, settings, hangs={4: 1})
+    found, script, said = run_scripted(tmp_path, monkeypatch, settings, hangs={4: 1})
     assert sorted(found) == list(range(9))
-    assert len(pool.killed) == 1
-    assert "gave no episode" in said[0]
+    assert len(script.started) == 3 + 1
+    assert "gave no answer" in said[0]
 
 
 def test_too_many_dead_workers_end_the_collection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,7 +122,7 @@ def test_workers_killed_and_stopped_are_replaced(
     errors = process.communicate(timeout=800)[1].decode()
     assert process.returncode == 0, errors
     assert "ended with SIGKILL: another takes its place" in errors
-    assert "gave no episode for 8 s: another takes its place" in errors
+    assert "gave no answer for 8 s: another takes its place" in errors
     assert not alive(killed)
     assert not alive(stopped)
     assert_no_orphans(process.pid)
@@ -140,7 +140,7 @@ def test_death_beyond_the_limit_ends_in_one_line_and_the_same_command_carries_on
     os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     errors = process.communicate(timeout=60)[1].decode()
     assert process.returncode == 1
-    assert errors.startswith("one line: a collector worker ended with SIGKILL")
+    assert errors.startswith("one line: a worker ended with SIGKILL")
     assert "Traceback" not in errors
     assert_no_orphans(process.pid)
     kept = {p.name: p.stat().st_mtime_ns for p in journal_path(out).glob("episode_*.npz")}

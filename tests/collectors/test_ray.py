@@ -48,11 +48,11 @@ def descendants(pid: int) -> list[int]:
 
 
 def actors() -> list[int]:
-    """Processes of the remote collectors that this process's cluster runs."""
+    """Processes of the workers that this process's cluster runs."""
     named = []
     for pid in descendants(os.getpid()):
         try:
-            if b"RemoteEpisodeCollector" in Path(f"/proc/{pid}/cmdline").read_bytes():
+            if b"ray::Body" in Path(f"/proc/{pid}/cmdline").read_bytes():
                 named.append(pid)
         except OSError:
             continue

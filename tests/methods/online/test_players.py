@@ -17,9 +17,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from playslot_rl import keys
+from playslot_rl.collectors import workers
 from playslot_rl.config import CollectorConfig, EnvConfig, RenderConfig
 from playslot_rl.errors import PlaySlotError
-from playslot_rl.methods.online import loop, players
+from playslot_rl.methods.online import loop
 from playslot_rl.methods.online.acting import PlayedEpisodes
 from playslot_rl.methods.online.players import Players, Round, play_round
 from playslot_rl.seeds.draws import StepGenerators
@@ -148,11 +149,11 @@ def test_a_worker_that_dies_is_replaced_and_its_part_played_again() -> None:
     try:
         crew.begin(wanted)
         before = crew.finish()
-        local: Any = crew._workers[0]
-        os.kill(next(iter(local._pool._processes)), signal.SIGKILL)
+        local: Any = crew.workers._places[0].worker
+        os.kill(local.process.pid, signal.SIGKILL)
         crew.begin(wanted)
         after = crew.finish()
-        assert crew.replaced == 1
+        assert crew.workers.replaced == 1
     finally:
         crew.close()
     assert torch.equal(before.frames[keys.ACTION], after.frames[keys.ACTION])
@@ -161,12 +162,12 @@ def test_a_worker_that_dies_is_replaced_and_its_part_played_again() -> None:
 
 
 def test_workers_that_hang_end_the_training_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(players, "START_S", 1.0)
+    monkeypatch.setattr(workers, "START_S", 1.0)
     learner: Any = ToyLearner()
     crew = Players(learner, partial(HangingPool, *TASK), 1, CollectorConfig(timeout_s=0.5, restarts=0))
     try:
         crew.begin(Round(3, 0, (5,), random=True))
-        with pytest.raises(PlaySlotError, match=r"played no round for 0\.5 s.*collector\.restarts=0.*carries on"):
+        with pytest.raises(PlaySlotError, match=r"gave no answer for 0\.5 s.*collector\.restarts=0.*carries on"):
             crew.finish()
     finally:
         crew.close()
