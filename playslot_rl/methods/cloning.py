@@ -30,8 +30,9 @@ from playslot_rl.data.demonstrations import (
     moving_frames,
     real_actions,
 )
-from playslot_rl.data.neighbours import Ends
+from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.windows import IntArray
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.demonstrated import cloned, policy_taken_over
@@ -164,6 +165,17 @@ class LatentCloning(ABC):
         return Demonstrations(features, features, seen.latents[rows], seen.actions[rows], episode, step, lengths)
 
 
+@torch.no_grad()
+def inferred(
+    infer: Callable[[Tensor], Tensor],
+    read: Callable[[IntArray], Tensor],
+    rows: IntArray,
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """What a model in evaluation mode infers (M, ...) from what `read` gives of rows (M, F), some at a time."""
+    return torch.cat([infer(read(some).to(device)) for some in in_batches(rows)])
+
+
 def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
     """With a decoder that reads the policy's features where `behaviour.decoder_state` says so."""
     decoder = replace(config.model.action_decoder, reads_slots=config.behaviour.decoder_state)
@@ -219,33 +231,31 @@ def action_stage(
 def cloning(
     record: StageRecord,
     behaviour: LatentCloning,
-    policy: StageConfig,
-    decoder_steps: int,
-    decoder_lr: float,
+    own: Any,
     at: str = "",
     views: int = 1,
 ) -> Training:
     """Latent policy, then action decoder, then both; the policy is taken over where another run has trained it.
 
-    `policy` is its schedule, `baselines.METHOD.policy`; the decoder has its own steps and rate, the rest is the
-    policy's.
+    The decoder has the `decoder_steps` and the `decoder_lr` of `own`, the rest is of the policy's schedule, which is
+    `baselines.METHOD.policy`, or the group `at`.
     """
-    config, name, split = record.config, record.name, record.demos
+    config, name, split, policy = record.config, record.name, record.demos, behaviour.schedule
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
     group, schedule = at or f"baselines.{name}", at or f"baselines.{name}.policy"
 
     def part(folder: str, stage: Stage, steps: int, lr: float) -> Part:
         kind = folder.partition("_")[0]
         typed = "behaviour.finetune" if kind == "finetune" else f"{group}.decoder"
-        own = replace(policy, steps=steps, optim=replace(policy.optim, lr=lr))
+        changed = replace(policy, steps=steps, optim=replace(policy.optim, lr=lr))
         renamed = {"steps": f"{typed}_steps", "optim.lr": f"{typed}_lr"}
         of = "action_decoder" if folder == "decoder" else folder
-        return Part(f"{name}.{of}", stage, own, folder, schedule, renamed, labelled)
+        return Part(f"{name}.{of}", stage, changed, folder, schedule, renamed, labelled)
 
     def parts() -> Iterator[Part]:
         clone = behaviour.policy_stage()
         yield Part(f"{name}.policy", clone, policy, group=schedule)
-        yield from behaviour.decoding(clone, part, decoder_steps, decoder_lr)
+        yield from behaviour.decoding(clone, part, own.decoder_steps, own.decoder_lr)
 
     said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos, views)
     return Training(

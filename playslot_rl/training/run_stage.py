@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -9,13 +11,16 @@ from typing import Any, Protocol
 import torch
 from torch import nn
 
+from playslot_rl.config import StageConfig
 from playslot_rl.data.demonstrations import transitions
 from playslot_rl.modules.action_range import range_of
 from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.storage.resume import sittings_of
 from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.patience import Patience
 from playslot_rl.training.record import StageRecord
+from playslot_rl.training.stage import ClipStage
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,34 @@ class Training:
 
     def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
         return _train(record, self, begin)
+
+
+def on_clips(
+    record: StageRecord,
+    stage: ClipStage,
+    own: StageConfig,
+    group: str = "",
+    said: Callable[[Mapping[str, float]], str] = lambda metrics: f"{metrics['psnr']:.2f} dB",
+    what: str = "clips",
+    *,
+    patience: Patience | None = None,
+    extra: Mapping[str, Any] | None = None,
+    identity: Mapping[str, Any] | None = None,
+) -> Training:
+    """The one part of a model trained on clips, by the settings `group` (empty: `baselines.NAME`); `said` makes the
+    closing line's words of its metrics, `what` names what was validated on.
+    """
+    same = identity or {}
+    return Training(
+        [Part(group or f"baselines.{record.name}", stage, own, patience=patience, pace=record.pace)],
+        record.device,
+        lambda metrics: (
+            f"{record.name}: {said(defaultdict(lambda: math.nan, metrics))} on {stage.clips.validated} {what}, "
+            f"{record.folder}"
+        ),
+        extra={"episodes": record.data.episodes, **(extra or {}), **same},
+        identity=same,
+    )
 
 
 class Prepared(Protocol):

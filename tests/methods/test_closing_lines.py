@@ -10,14 +10,14 @@ import pytest
 
 from playslot_rl.config import StageConfig
 from playslot_rl.methods.lapo.training import on_pairs
-from playslot_rl.methods.video.training import on_clips
+from playslot_rl.training.run_stage import on_clips
 
 
 @pytest.mark.parametrize("validated", ["held-out", "training"])
 def test_a_closing_line_says_which_clips_its_number_is_of(validated: str) -> None:
     """With a few episodes none is held out."""
     record: Any = SimpleNamespace(
-        name="model", device="cpu", folder=Path("runs/model"), data=SimpleNamespace(episodes=1)
+        name="model", device="cpu", pace=None, folder=Path("runs/model"), data=SimpleNamespace(episodes=1)
     )
     stage: Any = SimpleNamespace(clips=SimpleNamespace(validated=validated))
     lines = [make(record, stage, StageConfig()).line({"unexplained": 0.5, "psnr": 20}) for make in (on_pairs, on_clips)]

@@ -16,6 +16,7 @@ Shapes: M transitions, b rows of a batch, C channels of a state of H/8 x W/8, K 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
@@ -26,7 +27,7 @@ from torch.nn import functional as F
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import DemonstrationSplit, Transitions
-from playslot_rl.data.neighbours import in_batches, pairs_at
+from playslot_rl.data.neighbours import pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.caddy.heads import ORACLE, POLICY, MovesHead, StateHead, load_model, states_of
@@ -34,21 +35,20 @@ from playslot_rl.methods.caddy.method import CADDYConfig, CADDYOracleConfig, CAD
 from playslot_rl.methods.caddy.model import CADDY
 from playslot_rl.methods.caddy.networks import Encoder
 from playslot_rl.methods.caddy.stage import CADDYStage
-from playslot_rl.methods.cloning import LatentCloning, action_stage, cloning
-from playslot_rl.methods.video.training import on_clips, pixel_model
+from playslot_rl.methods.cloning import LatentCloning, action_stage, cloning, inferred
+from playslot_rl.methods.video.training import pixel_model
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
-from playslot_rl.training.run_stage import Training
+from playslot_rl.training.run_stage import Training, on_clips
 from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
     RegressionStage,
     unexplained,
 )
-from playslot_rl.world_model import module_device
 
 
 class StateInputs:
@@ -119,7 +119,7 @@ class CADDYBehaviour(LatentCloning):
         self.policy.standardise(self.trained.latents[:, sizes.actions :])
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        return infer_moves(self.model, source, moves)
+        return inferred(partial(infer_moves, self.model), source.pixels, pairs_at(moves.rows), self.device)
 
     def observe(self, frames: FrameInputs) -> Inputs:
         return StateInputs(self.model.encoder, frames)
@@ -147,14 +147,10 @@ def oracle_stage(
     )
 
 
-@torch.no_grad()
-def infer_moves(model: CADDY, source: EpisodeFrames, moves: Transitions) -> Tensor:
-    """Moves (M, K + Z) of transitions, a one-hot action and a variability each; the model in evaluation mode."""
-    parts = []
-    for pairs in in_batches(pairs_at(moves.rows)):
-        latents = model.infer(source.pixels(pairs).to(module_device(model)))
-        parts.append(torch.cat((latents.a, latents.v), dim=-1)[:, 0])
-    return torch.cat(parts)
+def infer_moves(model: CADDY, frames: Tensor) -> Tensor:
+    """Moves (B, K + Z) between pairs of frames (B, 2, 3, H, W), a one-hot action and a variability each."""
+    latents = model.infer(frames)
+    return torch.cat((latents.a, latents.v), dim=-1)[:, 0]
 
 
 def model(record: StageRecord) -> Training:
@@ -164,9 +160,8 @@ def model(record: StageRecord) -> Training:
 
 
 def policy(record: StageRecord) -> Training:
-    own: CADDYPolicyConfig = record.config.baselines.caddy_policy
     behaviour = CADDYBehaviour(record.config, record.parents["caddy"], record.demos, record.device)
-    return cloning(record, behaviour, own.policy, own.decoder_steps, own.decoder_lr)
+    return cloning(record, behaviour, behaviour.own)
 
 
 def oracle(record: StageRecord) -> Training:

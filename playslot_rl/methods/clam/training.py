@@ -29,6 +29,7 @@ from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.methods.clam.method import NAME, CLAMConfig
 from playslot_rl.methods.clam.model import Forward, Inverse
+from playslot_rl.methods.cloning import inferred
 from playslot_rl.methods.lapo.training import PixelCloning, on_pairs
 from playslot_rl.methods.supervised import LabelledMoves
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -94,15 +95,6 @@ class CLAMStage:
         return normalise(self.clips.pixels(self.ends.past(pairs[:, 1], 3), module_device(self.inverse)))
 
 
-@torch.no_grad()
-def infer_latents(
-    inverse: Inverse, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
-) -> Tensor:
-    """Latent actions (M, Z) of transitions; the model in evaluation mode."""
-    ends, parts = Ends.of(source), in_batches(moves.rows + 1)
-    return torch.cat([inverse(source.pixels(ends.past(rows, 3)).to(device)) for rows in parts])
-
-
 class PolicyStage(RegressionStage):
     """Trains the policy; the decoder, which stays as it is, is stored beside it."""
 
@@ -124,7 +116,7 @@ class CLAMBehaviour(PixelCloning):
         super().__init__(record, own.shift, own.loss)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        return infer_latents(self.inverse, source, moves, self.device)
+        return inferred(self.inverse, source.pixels, Ends.of(source).past(moves.rows + 1, 3), self.device)
 
     def new_decoder(self, latent_dim: int, state_dim: int) -> ActionDecoder:  # noqa: ARG002
         return self._decoder

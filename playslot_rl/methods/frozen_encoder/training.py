@@ -34,7 +34,7 @@ from playslot_rl.storage.checkpoints import load_weights
 from playslot_rl.training.demonstrated import cloning_alone
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
-from playslot_rl.training.run_stage import Training
+from playslot_rl.training.run_stage import Training, on_clips
 from playslot_rl.world_model import module_device
 
 STANDARDISED = 1024
@@ -84,15 +84,7 @@ def model(record: StageRecord) -> Training:
     with global_seed(record.config.seed, 0, record.name):
         network = video_encoder(own, record.config.env.image_size).to(record.device)
     stage = EncoderStage(record.name, network, record.clips(network.frames, shown=256), own.model)
-    return Training(
-        [Part(f"{own.group}model", stage, own.model)],
-        record.device,
-        lambda metrics: (
-            f"{record.name}: {metrics.get('psnr', float('nan')):.1f} dB on {stage.clips.validated} frames, "
-            f"{record.folder}"
-        ),
-        extra={"episodes": record.data.episodes},
-    )
+    return on_clips(record, stage, own.model, f"{own.group}model", lambda m: f"{m['psnr']:.1f} dB", "frames")
 
 
 def policy(record: StageRecord) -> Training:

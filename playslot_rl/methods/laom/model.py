@@ -88,9 +88,9 @@ class LatentActions(nn.Module):
         out: Tensor = self.forward_model(h.detach(), z)
         return out
 
-    def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], to the latent actions (B, Z) between them."""
-        h = self.features(torch.cat((normalise(first), normalise(second))))
+    def forward(self, pairs: Tensor) -> Tensor:
+        """Frames (B, 2, 3, H, W), uint8 or float [0, 1], to the latent actions (B, Z) between them."""
+        h = self.features(torch.cat(normalise(pairs).unbind(1)))
         return self.infer(*h.chunk(2)).float()
 
 

@@ -30,7 +30,7 @@ from playslot_rl.data.neighbours import Ends, in_batches, pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.frames import normalise
-from playslot_rl.methods.cloning import cloning
+from playslot_rl.methods.cloning import cloning, inferred
 from playslot_rl.methods.laom.method import NAME, LAOMConfig
 from playslot_rl.methods.laom.model import LatentActions, Target
 from playslot_rl.methods.lapo.training import PixelCloning, on_pairs
@@ -131,15 +131,6 @@ class LAOMStage:
         return pixels[:, 0], pixels[:, 1]
 
 
-@torch.no_grad()
-def infer_latents(
-    model: LatentActions, source: EpisodeFrames, moves: Transitions, device: torch.device | str = "cpu"
-) -> Tensor:
-    """Latent actions (M, Z) of transitions, one step each; the model in evaluation mode."""
-    frames = (source.pixels(pairs).to(device) for pairs in in_batches(pairs_at(moves.rows)))
-    return torch.cat([model(*pixels.unbind(1)) for pixels in frames])
-
-
 class LAOMBehaviour(PixelCloning):
     """A CheckpointError where the model is damaged."""
 
@@ -149,7 +140,7 @@ class LAOMBehaviour(PixelCloning):
         super().__init__(record, own.shift, own.loss)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        return infer_latents(self.model, source, moves, self.device)
+        return inferred(self.model, source.pixels, pairs_at(moves.rows), self.device)
 
 
 def built(own: LAOMConfig, image_size: int, action_dim: int) -> tuple[LatentActions, Target]:
@@ -177,5 +168,4 @@ def model(record: StageRecord) -> Training:
 
 
 def policy(record: StageRecord) -> Training:
-    own: LAOMConfig = record.config.baselines.laom
-    return cloning(record, LAOMBehaviour(record), own.policy, own.decoder_steps, own.decoder_lr)
+    return cloning(record, LAOMBehaviour(record), record.config.baselines.laom)

@@ -30,7 +30,7 @@ from torch.nn import functional as F
 from playslot_rl.acting.actor import Actor, latent_actor
 from playslot_rl.frames import normalise
 from playslot_rl.methods.decoded_policy import DecodedPolicy
-from playslot_rl.methods.lapo.method import MODEL, NAME, Encoder, LAPOConfig, LatentConfig
+from playslot_rl.methods.lapo.method import MODEL, NAME, Encoder, LAPOConfig, LatentConfig, Targets
 from playslot_rl.modules.quantizer import ActionQuantizer
 from playslot_rl.runs import Run
 from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -144,6 +144,11 @@ class QuantisedInverse(nn.Module):
         for buffer, value in ((self.standardise.running_mean, z.mean(0)), (self.standardise.running_var, z.var(0))):
             assert buffer is not None
             buffer.copy_(value)
+
+    def latents(self, targets: Targets, frames: Tensor) -> Tensor:
+        """Latent actions (B, Z) of frames (B, F, ...), as `LatentConfig.targets` says."""
+        found: Inferred = self(frames)
+        return found.z if targets == "quantised" else found.before
 
     def forward(self, frames: Tensor) -> Inferred:
         """Frames (B, F, ...) to latent actions between the last two; the codebooks move in training mode."""

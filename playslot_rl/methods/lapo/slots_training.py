@@ -9,6 +9,7 @@ Shapes: M transitions, F frames, N slots, D slot width, Z latent-action width.
 from __future__ import annotations
 
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,13 +18,14 @@ from torch import Tensor
 from playslot_rl.config import StageConfig
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.demonstrations import Transitions, moving_slots, real_actions, transitions
+from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.cloning import LatentCloning, Seen, cloning
+from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred
 from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
 from playslot_rl.methods.lapo.slots_method import MODEL, LAPOSlotsConfig
-from playslot_rl.methods.lapo.training import TWO, LAPOModelStage, infer_latents, on_pairs
+from playslot_rl.methods.lapo.training import TWO, LAPOModelStage, on_pairs
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import demonstration_views
@@ -67,10 +69,9 @@ class LAPOSlotsBehaviour(LatentCloning):
             self.decoder = self.new_decoder(own.latent_dim, width)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        slots = self.parsed[id(source)]
-        quantised = self.own.targets == "quantised"
-        read = lambda rows: torch.from_numpy(slots[rows])  # noqa: E731
-        return infer_latents(self.inverse, source, moves, self.device, quantised, read)
+        slots, rows = self.parsed[id(source)], Ends.of(source).past(moves.rows + 1, self.own.frames)
+        infer = partial(self.inverse.latents, self.own.targets)
+        return inferred(infer, lambda some: torch.from_numpy(slots[some]), rows, self.device)
 
     def criterion(self) -> BehaviourLoss:
         return BehaviourLoss(self.policy, self.loss)
@@ -90,6 +91,5 @@ class LAPOSlotsBehaviour(LatentCloning):
 
 
 def policy(record: StageRecord) -> Training:
-    own, behaviour = record.config.behaviour, LAPOSlotsBehaviour(record)
-    views = len(behaviour.views)
-    return cloning(record, behaviour, behaviour.schedule, own.decoder_steps, own.decoder_lr, "behaviour", views)
+    behaviour = LAPOSlotsBehaviour(record)
+    return cloning(record, behaviour, record.config.behaviour, "behaviour", len(behaviour.views))

@@ -33,7 +33,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import IntArray
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
-from playslot_rl.methods.cloning import LatentCloning, cloning
+from playslot_rl.methods.cloning import LatentCloning, cloning, inferred
 from playslot_rl.methods.lapo.method import NAME, LAPOConfig
 from playslot_rl.methods.lapo.model import ForwardModel, InverseModel, LAPOPolicy, QuantisedInverse
 from playslot_rl.modules.quantizer import usage
@@ -42,9 +42,8 @@ from playslot_rl.runtime.processes import spread
 from playslot_rl.runtime.shares import own_rows
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import StageCheckpoint
-from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
-from playslot_rl.training.run_stage import Training
+from playslot_rl.training.run_stage import Training, on_clips
 from playslot_rl.training.stage import ClipStage
 from playslot_rl.world_model import module_device
 
@@ -126,23 +125,6 @@ class LAPOModelStage:
         return self.read(self.ends.past(pairs[:, 1], self.inverse.config.frames))
 
 
-@torch.no_grad()
-def infer_latents(
-    inverse: QuantisedInverse,
-    source: EpisodeFrames,
-    moves: Transitions,
-    device: torch.device | str = "cpu",
-    quantised: bool = False,
-    read: Callable[[IntArray], Tensor] | None = None,
-) -> Tensor:
-    """Latent actions (M, Z) of transitions, from frames or what `read` gives of rows; the model in evaluation mode."""
-    ends, parts = Ends.of(source), []
-    for rows in in_batches(moves.rows + 1):
-        inferred = inverse((read or source.pixels)(ends.past(rows, inverse.config.frames)).to(device))
-        parts.append(inferred.z if quantised else inferred.before)
-    return torch.cat(parts)
-
-
 class PixelCloning(LatentCloning):
     """See `LatentCloning`: a policy on frames clones what the model infers from them."""
 
@@ -164,7 +146,8 @@ class LAPOBehaviour(PixelCloning):
         super().__init__(record, own.shift, own.loss)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
-        return infer_latents(self.inverse, source, moves, self.device, self.targets == "quantised")
+        rows = Ends.of(source).past(moves.rows + 1, self.inverse.config.frames)
+        return inferred(partial(self.inverse.latents, self.targets), source.pixels, rows, self.device)
 
 
 def load_inverse(model: StageCheckpoint, device: torch.device | str) -> InverseModel:
@@ -190,17 +173,11 @@ def on_pairs(
     record: StageRecord, stage: ClipStage, schedule: StageConfig, what: str = "change", labels: str = ""
 ) -> Training:
     """The training of a model of latent actions by `schedule`, `baselines.METHOD.model`; `what` is `unexplained`."""
-    return Training(
-        [Part(f"baselines.{record.name.removesuffix('_model')}.model", stage, schedule)],
-        record.device,
-        lambda metrics: (
-            f"{record.name}: {100 * metrics.get('unexplained', float('nan')):.0f} % of the {what} left on "
-            f"{stage.clips.validated} pairs{labels}, {record.folder}"
-        ),
-        extra={"episodes": record.data.episodes},
+    group = f"baselines.{record.name.removesuffix('_model')}.model"
+    return on_clips(
+        record, stage, schedule, group, lambda m: f"{100 * m['unexplained']:.0f} % of the {what} left", f"pairs{labels}"
     )
 
 
 def policy(record: StageRecord) -> Training:
-    own: LAPOConfig = record.config.baselines.lapo
-    return cloning(record, LAPOBehaviour(record), own.policy, own.decoder_steps, own.decoder_lr)
+    return cloning(record, LAPOBehaviour(record), record.config.baselines.lapo)

@@ -8,10 +8,9 @@ from playslot_rl.modules.savi import SAVi
 from playslot_rl.runs import Run
 from playslot_rl.runtime.processes import here
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.fit import Part
 from playslot_rl.training.patience import patience_of
 from playslot_rl.training.record import StageRecord
-from playslot_rl.training.run_stage import Training
+from playslot_rl.training.run_stage import Training, on_clips
 from playslot_rl.training.stage_slots import SlotsStage, warm_start
 
 
@@ -28,12 +27,7 @@ def training(record: StageRecord) -> Training:
         warm_start(savi, other.load_savi(device), own.start_from)
         started = {"started_from": other.stage("slots").fingerprint}
     stage = SlotsStage(savi, record.clips(own.clip_frames), own, known)
-    return Training(
-        [Part("slots", stage, own, patience=patience_of(own.patience, "mse"), pace=record.pace)],
-        device,
-        lambda metrics: (
-            f"slots: {metrics.get('psnr', float('nan')):.2f} dB on {stage.clips.validated} clips, {record.folder}"
-        ),
-        extra={**record.seen(own.clip_frames), "agent_steps": int((source.lengths - 1).sum()), **started},
-        identity=started,
+    extra = {**record.seen(own.clip_frames), "agent_steps": int((source.lengths - 1).sum())}
+    return on_clips(
+        record, stage, own, "slots", patience=patience_of(own.patience, "mse"), extra=extra, identity=started
     )

@@ -25,13 +25,13 @@ from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import draw_frames, of_frames
 from playslot_rl.methods.svg.method import SVGConfig
 from playslot_rl.methods.svg.model import SVG, Gaussian, TeacherForced
-from playslot_rl.methods.video.training import on_clips, pixel_model
+from playslot_rl.methods.video.training import pixel_model
 from playslot_rl.runs import Run
 from playslot_rl.runtime.precision import autocast
 from playslot_rl.runtime.processes import spread
 from playslot_rl.seeds.draws import StepGenerators, step_generator
 from playslot_rl.training.record import StageRecord
-from playslot_rl.training.run_stage import Training
+from playslot_rl.training.run_stage import Training, on_clips
 from playslot_rl.world_model import module_device
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -10,16 +10,14 @@ from typing import Any
 import torch
 from torch import nn
 
-from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, ModelConfig, StageConfig
+from playslot_rl.config import DynamicsStageConfig, ExperimentConfig, ModelConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.methods.video.predictor import SlotVideo
 from playslot_rl.runs import Run
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.fit import Part
-from playslot_rl.training.patience import Patience, patience_of
+from playslot_rl.training.patience import patience_of
 from playslot_rl.training.record import StageRecord
-from playslot_rl.training.run_stage import Training
-from playslot_rl.training.stage import ClipStage
+from playslot_rl.training.run_stage import Training, on_clips
 from playslot_rl.training.stage_dynamics import dynamics_on_slots
 from playslot_rl.world_model import WorldModel
 
@@ -34,25 +32,6 @@ def check_pixel_model(build: Callable[[Any, int], nn.Module], config: Experiment
     """Refuse frames that a model of frames cannot take, before anything is computed; raises as `pixel_model`."""
     with torch.device("meta"):
         _fitting(build, getattr(config.baselines, name), config, name)
-
-
-def on_clips(
-    record: StageRecord,
-    stage: ClipStage,
-    own: StageConfig,
-    patience: Patience | None = None,
-    extra: Mapping[str, Any] | None = None,
-) -> Training:
-    """The one part of a model trained on clips, by its settings `baselines.NAME`; `extra` goes to `meta.json`."""
-    return Training(
-        [Part(f"baselines.{record.name}", stage, own, patience=patience)],
-        record.device,
-        lambda metrics: (
-            f"{record.name}: {metrics.get('psnr', float('nan')):.2f} dB on {stage.clips.validated} clips, "
-            f"{record.folder}"
-        ),
-        extra={"episodes": record.data.episodes, **(extra or {})},
-    )
 
 
 def _fitting[Model: nn.Module](
@@ -72,7 +51,7 @@ def uncontrolled(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
 def training(record: StageRecord) -> Training:
     own: DynamicsStageConfig = getattr(record.config.baselines, record.name)
     stage = dynamics_on_slots(record, record.groups["model"], own)
-    return on_clips(record, stage, own, patience_of(own.patience, "mse_slot"))
+    return on_clips(record, stage, own, patience=patience_of(own.patience, "mse_slot"))
 
 
 def _load(name: str, run: Run, device: torch.device | str = "cpu") -> SlotVideo:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,12 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compose import compose
 from playslot_rl.data.demonstrations import DemonstrationSplit, transitions
+from playslot_rl.data.neighbours import pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.methods.caddy.behaviour import CADDYBehaviour, MovesLoss, infer_moves, oracle_stage
 from playslot_rl.methods.caddy.heads import MovesHead, OnFrames, as_moves, states_of
 from playslot_rl.methods.caddy.model import CADDY
+from playslot_rl.methods.cloning import inferred
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.checkpoints import StageCheckpoint, save_stage
@@ -202,7 +205,7 @@ def test_validation_counts_mistaken_actions_and_unexplained_variability_on_held_
 def test_moves_of_transitions_are_in_the_order_of_their_rows(caddy: CADDY) -> None:
     source = moving_square()
     moves = transitions(source)
-    found = infer_moves(caddy, source, moves)
+    found = inferred(partial(infer_moves, caddy), source.pixels, pairs_at(moves.rows))
     assert found.shape == (len(moves.rows), 5)
     latents = caddy.infer(source.pixels(np.array([[moves.rows[7], moves.rows[7] + 1]])))
     torch.testing.assert_close(found[7], torch.cat((latents.a, latents.v), dim=-1)[0, 0], atol=1e-5, rtol=1e-4)

@@ -16,7 +16,8 @@ from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.views import first_demonstrations
 from playslot_rl.methods.clam.method import CLAMConfig
 from playslot_rl.methods.clam.model import Forward, Inverse
-from playslot_rl.methods.clam.training import CLAMStage, infer_latents
+from playslot_rl.methods.clam.training import CLAMStage
+from playslot_rl.methods.cloning import inferred
 from playslot_rl.methods.supervised import LabelledMoves
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
@@ -40,7 +41,7 @@ def test_it_sees_the_frame_before_the_frame_and_the_next_and_an_episodes_first_f
     rows = Ends.of(source).past(transitions(source).rows + 1, 3)
     assert rows.tolist() == [[0, 0, 1], [0, 1, 2], [1, 2, 3], [4, 4, 5], [4, 5, 6], [5, 6, 7]]
     inverse = stage().inverse.eval()
-    latents = infer_latents(inverse, source, transitions(source))
+    latents = inferred(inverse, source.pixels, rows)
     torch.testing.assert_close(latents[2:3], inverse(source.pixels(np.array([[1, 2, 3]]))))
 
 

@@ -15,11 +15,12 @@ from playslot_rl.config import StageConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
-from playslot_rl.data.neighbours import Ends
+from playslot_rl.data.neighbours import Ends, pairs_at
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import drawn_demonstrations, first_demonstrations
+from playslot_rl.methods.cloning import inferred
 from playslot_rl.methods.laom.method import LAOMConfig
-from playslot_rl.methods.laom.training import LAOMStage, built, infer_latents
+from playslot_rl.methods.laom.training import LAOMStage, built
 from playslot_rl.methods.supervised import LabelledMoves, jittered
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.training.stage import step_loss
@@ -163,7 +164,7 @@ def test_labels_make_the_action_readable_off_the_latents_where_something_else_mo
             optimizer.zero_grad()
             step_loss(made, step, StepGenerators(0, step))["loss"].backward()
             optimizer.step()
-        latents = infer_latents(made.model.eval(), source, moves)
+        latents = inferred(made.model.eval(), source.pixels, pairs_at(moves.rows))
         actions = torch.from_numpy(source.actions[moves.rows, :1])
         found[weight] = probed(latents[labelled:], actions[labelled:])
     assert 1 - found[1.0] < 0.4 * (1 - found[0.0])

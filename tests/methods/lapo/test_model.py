@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,9 +21,10 @@ from playslot_rl.data.demonstrations import transitions
 from playslot_rl.data.neighbours import Ends
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.lapo.method import Encoder, LAPOConfig
+from playslot_rl.methods.cloning import inferred
+from playslot_rl.methods.lapo.method import Encoder, LAPOConfig, Targets
 from playslot_rl.methods.lapo.model import ConvEncoder, ForwardModel, InverseModel, LAPOPolicy, sizes
-from playslot_rl.methods.lapo.training import LAPOModelStage, infer_latents, load_inverse
+from playslot_rl.methods.lapo.training import LAPOModelStage, load_inverse
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.seeds.draws import StepGenerators, global_seed
 from playslot_rl.storage.checkpoints import save_stage
@@ -45,14 +48,14 @@ def models() -> Models:
 
 def test_a_latent_action_is_made_of_codes_of_two_codebooks(models: Models) -> None:
     inverse, frames = models[0], torch.rand(6, 3, 3, 32, 32)
-    inferred = inverse(frames)
-    assert inferred.z.shape == (6, 8)
-    assert inferred.code.shape == (6, 2)
-    inferred = inverse.eval()(frames)
+    alone = inverse(frames)
+    assert alone.z.shape == (6, 8)
+    assert alone.code.shape == (6, 2)
+    alone = inverse.eval()(frames)
     books = [quantizer.prototypes for quantizer in inverse.quantizers]
     assert len(books) == 2
-    codes = [book[inferred.code[:, number]] for number, book in enumerate(books)]
-    torch.testing.assert_close(inferred.z, torch.cat(codes, dim=1), atol=1e-5, rtol=0)
+    codes = [book[alone.code[:, number]] for number, book in enumerate(books)]
+    torch.testing.assert_close(alone.z, torch.cat(codes, dim=1), atol=1e-5, rtol=0)
 
 
 def test_the_codebooks_move_in_training_only(models: Models) -> None:
@@ -153,8 +156,8 @@ def test_the_image_error_trains_the_inverse_model_through_the_latent(models: Mod
         for weights in forward.ups[-1].parameters():
             weights.normal_(std=0.1)
     frames = torch.rand(4, 3, 3, 32, 32)
-    inferred = inverse(frames)
-    (forward(frames[:, :-1], inferred.z) - frames[:, -1]).square().mean().backward()
+    alone = inverse(frames)
+    (forward(frames[:, :-1], alone.z) - frames[:, -1]).square().mean().backward()
     grads = [p.grad for p in inverse.network.parameters()]
     assert all(grad is not None for grad in grads)
     assert any(bool(grad.abs().sum() > 0) for grad in grads if grad is not None)
@@ -196,13 +199,13 @@ def test_training_predicts_the_change_and_the_codes_tell_directions_apart(
 def test_latents_of_transitions_are_in_the_order_of_their_rows(models: Models) -> None:
     inverse, source = models[0].eval(), moving_square()
     moves = transitions(source)
-    latents = infer_latents(inverse, source, moves)
+    rows = Ends.of(source).past(moves.rows + 1, 3)
+    latents, after = (inferred(partial(inverse.latents, kind), source.pixels, rows) for kind in get_args(Targets))
     assert latents.shape == (len(moves.rows), 8)
     frames = source.pixels(moves.rows[7] + np.array([[-1, 0, 1]]))
-    inferred = inverse(frames)
-    torch.testing.assert_close(latents[7:8], inferred.before, atol=1e-5, rtol=0)
-    after = infer_latents(inverse, source, moves, quantised=True)  # baselines.lapo.targets=quantised
-    torch.testing.assert_close(after[7:8], inferred.z, atol=1e-5, rtol=0)
+    alone = inverse(frames)
+    torch.testing.assert_close(latents[7:8], alone.before, atol=1e-5, rtol=0)
+    torch.testing.assert_close(after[7:8], alone.z, atol=1e-5, rtol=0)
     assert not torch.allclose(after, latents)
 
 
