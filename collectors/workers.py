@@ -132,6 +132,7 @@ class _Place:
     worker: LocalWorker | RayWorker
     calls: deque[tuple[Call, Future[Any]]] = field(default_factory=deque)
     silent_s: float = 0.0
+    starting: bool = True
 
 
 class Workers:
@@ -182,6 +183,8 @@ class Workers:
         waited = min(time.monotonic() - began, 2 * POLL_S)
         for number, place in enumerate(self._places):
             place.silent_s += waited if place.calls else 0.0
+            if place.starting and place.worker.ready.done():
+                place.starting, place.silent_s = False, 0.0
             while place.calls and place.calls[0][1].done():
                 try:
                     answer = place.calls[0][1].result()
@@ -191,7 +194,7 @@ class Workers:
                 place.silent_s = 0.0
                 yield place.calls.popleft()[0], answer
             else:
-                if place.silent_s >= self.settings.timeout_s + (0.0 if place.worker.ready.done() else START_S):
+                if place.silent_s >= self.settings.timeout_s + START_S * place.starting:
                     self._replace(number, f"gave no answer for {self.settings.timeout_s:g} s")
 
     def close(self) -> None:

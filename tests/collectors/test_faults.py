@@ -109,6 +109,23 @@ def test_a_worker_that_hangs_is_killed_and_replaced(tmp_path: Path, monkeypatch:
     assert "gave no answer" in said[0]
 
 
+def test_the_time_that_a_worker_takes_to_start_is_not_its_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    script, said = Script({}, {4: 1}), list[str]()
+    monkeypatch.setattr(workers, "LocalWorker", lambda make: ScriptedWorker(script))
+    monkeypatch.setattr(workers, "POLL_S", 0.02)
+    settings = CollectorConfig(timeout_s=0.01)
+    pool = workers.Workers(lambda: lambda index: None, 1, settings, lambda why, _: said.append(why))
+    ready = script.started[0].ready = Future()
+    pool.submit(0, 4)
+    assert (list(pool.answers()), said) == ([], [])
+    ready.set_result(None)
+    assert (list(pool.answers()), said) == ([], [])
+    assert list(pool.answers()) == []
+    assert "gave no answer" in said[0]
+    assert list(pool.answers()) == [((4,), None)]
+    pool.close()
+
+
 def test_too_many_dead_workers_end_the_collection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(PlaySlotError, match=r"collector\.restarts=2.*the same command carries on"):
         run_scripted(tmp_path, monkeypatch, CollectorConfig(restarts=2), dies={0: 99})

@@ -53,7 +53,7 @@ def test_the_sizes_of_every_preset_fit_together(task: str, preset: str) -> None:
     with torch.device("meta"):
         frames = torch.empty(2, 3, 3, size, size)
         model = LatentActions(laom, size, config.env.action_dim)
-        z = model(frames[:, 0], frames[:, 2])
+        z = model(frames[:, ::2])
         assert z.shape == LAPOPolicy(laom, size)(frames[:, 0]).shape == (2, laom.latent_dim)
         assert model.change(model.features(frames[:, 0]), z).shape == (2, model.features.width)
         z = Inverse(clam, size)(frames)
