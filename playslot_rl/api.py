@@ -177,9 +177,8 @@ class PlaySlot:
         if len(lead) > 2:
             raise ValueError(f"frames: got {pixels.ndim} dimensions, expected 3 (a frame), 4 (a clip) or 5 (clips)")
         clips = pixels.reshape((1,) * (2 - len(lead)) + tuple(pixels.shape))
-        slots, _ = self.world_model.savi(clips, generator=self._generator())
-        out: Tensor = slots.reshape(*lead, *slots.shape[2:])
-        return out
+        slots = self.world_model.savi.parse(clips, self._seed)
+        return slots.reshape(*lead, *slots.shape[2:])
 
     @torch.no_grad()
     def infer_actions(self, slots: Array) -> LatentActions:

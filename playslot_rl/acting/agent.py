@@ -130,7 +130,6 @@ class ReplayActor(PlannedActor):
         """Plan whole episodes; initial slots that are sampled depend on the first seed."""
         memory, model = super().reset(seeds), self.agent.world_model
         frames, actions = (part.to(self.device) for part in self.performed(seeds))
-        generator = torch.Generator(self.device).manual_seed(seeds[0])
-        slots, _ = model.savi(normalise(frames), generator=generator)
+        slots = model.savi.parse(normalise(frames), seeds[0])
         memory[keys.PLANNED_ACTIONS] = self.agent.action_decoder(model.inverse_dynamics(slots, actions).z)
         return memory

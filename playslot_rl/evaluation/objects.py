@@ -78,9 +78,7 @@ def seed_frames(steps: int) -> int:
 @torch.no_grad()
 def parse_clips(model: WorldModel, frames: npt.NDArray[np.uint8]) -> ParsedClips:
     """Parse clips (C, T + 1, H, W, 3), infer their latent actions and predict the frames after the seed frames."""
-    device = module_device(model.savi)
-    generator = torch.Generator(device).manual_seed(0)
-    slots, _ = model.savi(to_float(frames, device), generator=generator)
+    slots = model.savi.parse(to_float(frames, module_device(model.savi)))
     decoded = model.savi.decode(slots)
     latent = model.inverse_dynamics(slots)
     seed = seed_frames(frames.shape[1] - 1)
@@ -265,7 +263,7 @@ def score_slots(savi: SAVi, episodes: Iterable[Segmented], seeds: Sequence[int])
     device, scores = module_device(savi), []
     for (frames, truth), seed in zip(episodes, seeds, strict=True):
         real = to_float(frames[None], device)
-        decoded = savi.decode(savi(real, generator=torch.Generator(device).manual_seed(seed))[0])
+        decoded = savi.decode(savi.parse(real, seed))
         found = owners(decoded.masks[0]).cpu().numpy()
         ari, foreground = adjusted_rand_index(truth, found), adjusted_rand_index(truth, found, foreground=True)
         decibels = float(psnr((decoded.frames - real).square().mean()))

@@ -184,10 +184,8 @@ def cost_along_solution(
     errors, moved = [], []
     for goal in goals:
         frames = normalise(torch.from_numpy(goal.frames).movedim(-1, -3).to(device))
-        generator = torch.Generator(device).manual_seed(goal.seed)
-        slots = model.savi(frames[None], generator=generator)[0][0]
-        generator.manual_seed(goal.seed)
-        state = model.savi(frames[None, :1], generator=generator)[1]
+        slots = model.savi.parse(frames[None], goal.seed)[0]
+        state = model.savi(frames[None, :1], generator=torch.Generator(device).manual_seed(goal.seed))[1]
         there = parse_goal(model.savi, state, goal.image[None].to(device), looks)[0]
         distances = {kind: goal_distance(agent, kind, there, goal.image.to(device), match) for kind in curves}
         for name, to_goal in distances.items():

@@ -163,10 +163,7 @@ def parse_last(model: WorldModel, frames: Frame, seed: int) -> Tensor:
     """Slots (1, N, D) of the last of some consecutive frames uint8 (T, H, W, 3), the first of which starts an episode:
     SAVi goes on from earlier frames, as it did in training.
     """
-    device = module_device(model)
-    slots, _ = model.savi(to_float(frames, device)[None], generator=torch.Generator(device).manual_seed(seed))
-    out: Tensor = slots[:, -1].clone()
-    return out
+    return model.savi.parse(to_float(frames, module_device(model))[None], seed)[:, -1].clone()
 
 
 class RecordedStarts:

@@ -82,9 +82,7 @@ def variability_directions(model: WorldModel, clips: npt.NDArray[np.uint8] | Non
     prototypes = require_prototypes(model)
     if clips is None or clips.shape[1] < 2:
         return (CODEBOOK_SHARE * _principal(prototypes)).expand(len(prototypes), -1).clone()
-    device = module_device(model)
-    slots, _ = model.savi(to_float(clips, device), generator=torch.Generator(device).manual_seed(0))
-    latents = model.inverse_dynamics(slots)
+    latents = model.inverse_dynamics(model.savi.parse(to_float(clips, module_device(model))))
     code, z = latents.code.flatten(), latents.z.flatten(0, -2)
     difference = z - prototypes[code]
     overall = _principal(difference)

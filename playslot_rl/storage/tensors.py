@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from playslot_rl.errors import CheckpointError, first_line
 from playslot_rl.storage.atomic import write_bytes
-
-LONGEST_HEADER: Final = 100_000_000
-"""Bytes, as safetensors has it."""
 
 
 @runtime_checkable
@@ -50,31 +46,17 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
 def load_tensors(path: Path) -> dict[str, Tensor]:
     """Read a safetensors file onto the CPU; a CheckpointError where it is missing, truncated, or of another kind."""
     from safetensors import SafetensorError
-    from safetensors.torch import load
+    from safetensors.torch import load_file
 
     try:
-        _check_header(path)
-        return load(path.read_bytes())
+        return load_file(path)
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing, expected a checkpoint's weights: train that stage again") from error
-    except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+    except (SafetensorError, LookupError) as error:
         raise CheckpointError(
             f"{path} is damaged ({first_line(error)}), expected a whole safetensors file: "
             "delete its folder and run the same command again"
         ) from error
-
-
-def _check_header(path: Path) -> None:
-    """Refuse, by a ValueError, a file whose header does not account for its size, before more is read."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        if not 2 <= length <= min(size - 8, LONGEST_HEADER):
-            raise ValueError(f"a header of {length} bytes in a file of {size}")
-        header = json.loads(file.read(length))
-    ends = [int(tensor["data_offsets"][1]) for name, tensor in header.items() if name != "__metadata__"]
-    if 8 + length + max(ends, default=0) != size:
-        raise ValueError(f"tensors of {max(ends, default=0)} bytes in a file of {size}")
 
 
 def load_modules(modules: Mapping[str, nn.Module], tensors: Mapping[str, Tensor], where: str) -> None:

@@ -120,19 +120,13 @@ def warm_start(savi: SAVi, source: SAVi, where: str) -> None:
     that has learned elsewhere to take scenes apart leaves it early.
     """
     own, other = savi.state_dict(), source.state_dict()
-    shapes = [
-        (
-            name,
-            tuple(other[name].shape) if name in other else "nothing",
-            tuple(own[name].shape) if name in own else "nothing",
-        )
-        for name in sorted({*own, *other} - {INITIAL_SLOTS})
-    ]
-    for name, got, expected in shapes:
-        if got != expected:
+    got, expected = ({name: tuple(value.shape) for name, value in state.items()} for state in (other, own))
+    for name in sorted({*own, *other} - {INITIAL_SLOTS}):
+        if got.get(name) != expected.get(name):
             raise CheckpointError(
-                f"slots.start_from={where}: got {name} of {got}, expected {expected}: give model.savi.* its sizes, or "
-                "start from scratch (slots.start_from=)"
+                f"slots.start_from={where}: got {name} of {got.get(name, 'nothing')}, expected "
+                f"{expected.get(name, 'nothing')}: give model.savi.* its sizes, or start from scratch "
+                "(slots.start_from=)"
             )
     with torch.no_grad():
         rows = min(len(own[INITIAL_SLOTS]), len(other[INITIAL_SLOTS]))

@@ -20,7 +20,7 @@ from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, record
 from playslot_rl.colours import segmentation
 from playslot_rl.frames import to_float, to_uint8
 from playslot_rl.visualization.grid import film_strip, image_grid
-from playslot_rl.world_model import Agent, WorldModel
+from playslot_rl.world_model import Agent, WorldModel, module_device
 
 Frames = npt.NDArray[np.uint8]
 
@@ -30,9 +30,7 @@ def slot_cells(model: WorldModel, frames: Frames) -> Frames:
     """Rows of pictures (3 + N, T, H, W, 3) of a clip (T, H, W, 3): frame, reconstruction, segmentation, then the frame
     as each slot sees it (its colours weighted by its mask, on white).
     """
-    device = next(model.savi.parameters()).device
-    slots, _ = model.savi(to_float(frames, device)[None], generator=torch.Generator(device).manual_seed(0))
-    decoded = model.savi.decode(slots[0])
+    decoded = model.savi.decode(model.savi.parse(to_float(frames, module_device(model))[None])[0])
     objects = decoded.rgb.clamp(0, 1) * decoded.masks + (1 - decoded.masks)
     rows = [frames, to_uint8(decoded.frames), segmentation(to_uint8(decoded.frames), decoded.masks.cpu().numpy())]
     rows += [to_uint8(objects[:, n]) for n in range(objects.shape[1])]
@@ -54,9 +52,7 @@ def prototype_frames(model: WorldModel, frame: Frames, steps: int = 15) -> Frame
     mode = model.config.inverse_dynamics.mode
     if mode not in ("hybrid", "discrete"):
         raise ValueError(f"prototypes: got latent-action mode {mode}, expected hybrid or discrete")
-    device = next(model.savi.parameters()).device
-    generator = torch.Generator(device).manual_seed(0)
-    slots, _ = model.savi(to_float(frame, device)[None, None], generator=generator)
+    slots = model.savi.parse(to_float(frame, module_device(model))[None, None])
     prototypes = model.inverse_dynamics.prototypes
     k = len(prototypes)
     p = prototypes[:, None].expand(k, steps, -1)

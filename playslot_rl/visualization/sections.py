@@ -14,6 +14,7 @@ from playslot_rl.evaluation.objects import SLOTS_RESULT
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS, hardware
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import to_float
+from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.training.logging import History
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
@@ -97,12 +98,8 @@ def interval(ci: list[float] | None) -> str:
 
 
 def seconds(value: float | None) -> str:
-    """`42 s`, `7.5 min`, `3.2 h`, or a dash."""
-    if value is None:
-        return "–"
-    if value < 120:
-        return f"{value:.0f} s"
-    return f"{value / 60:.1f} min" if value < 7200 else f"{value / 3600:.1f} h"
+    """A duration, or a dash."""
+    return "–" if value is None else format_seconds(value)
 
 
 def read_evaluations(run: Path) -> dict[str, dict[str, Any]]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from foreign import LENGTHS, foreign_frames
+from tiny_savi import tiny_savi
 
 from playslot_rl.config import DataConfig
 from playslot_rl.data import agreement
@@ -23,7 +24,7 @@ from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runtime import processes
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.testing import tiny_config, tiny_savi
+from playslot_rl.testing import tiny_config
 
 CAMERA = "observation.images.top"
 

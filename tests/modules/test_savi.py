@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tiny_savi import tiny_savi
 
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.modules.savi.corrector import SlotAttention
 from playslot_rl.modules.savi.initializer import SlotInitializer
-from playslot_rl.testing import tiny_savi
 
 
 def small(initial: str = "learned", **changes: object) -> SAVi:

@@ -150,8 +150,8 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
     "a foreign tensor": (edit_tensors(lambda t: t.update(x=torch.zeros(1))), "unexpected tensor x"),
     "a misshapen tensor": (edit_tensors(reshape), r"has shape \(3,\), expected"),
     "weights that are NaN": (edit_tensors(set_nan), "holds values that are NaN"),
-    "a header of an absurd length": (absurd_header, "a header of 4611686018427387904 bytes"),
-    "a terabyte of holes": (grown, "in a file of 1099511627776"),
+    "a header of an absurd length": (absurd_header, "header too large"),
+    "a terabyte of holes": (grown, "file not fully covered"),
     "another frame size than it says": (
         edit_config(lambda v: v["input_features"]["observation.images.front"].update(shape=[3, 96, 96])),
         "input_features: got shapes",

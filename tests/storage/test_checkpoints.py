@@ -90,7 +90,7 @@ def test_a_file_of_holes_is_refused_by_its_header(tmp_path: Path) -> None:
     path.write_bytes(framed({"a": TENSOR}, bytes(8)))
     with path.open("r+b") as file:
         file.truncate(1 << 40)
-    with pytest.raises(CheckpointError, match="tensors of 8 bytes in a file of 1099511627776"):
+    with pytest.raises(CheckpointError, match="file not fully covered"):
         load_tensors(path)
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from tiny_savi import tiny_savi
 
 from playslot_rl.config import LoggingConfig, OptimConfig, SAViConfig, SlotsStageConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.seeds.draws import step_generator
-from playslot_rl.testing import tiny_savi
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.logging import History
 from playslot_rl.training.slot_warnings import slot_warnings

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
+from tiny_savi import tiny_savi
 from tiny_stages import SETTINGS, clips, videos
 from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.seeds.draws import StepGenerators
-from playslot_rl.testing import tiny_savi
 from playslot_rl.training.stage import step_loss
 from playslot_rl.training.stage_slots import SlotsStage
 

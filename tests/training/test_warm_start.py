@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tiny_savi import tiny_savi
 
 from playslot_rl.errors import CheckpointError
-from playslot_rl.testing import tiny_savi
 from playslot_rl.training.stage_slots import warm_start
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tiny_savi import tiny_savi
 from torch import nn
 
 from playslot_rl import keys
@@ -56,7 +57,6 @@ from playslot_rl.methods.svg.training import SVGStage
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.testing import tiny_savi
 from playslot_rl.training.fit import Part
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage
 from playslot_rl.training.stage_dynamics import DynamicsStage

@@ -46,12 +46,6 @@ def check_clip(frames: Tensor, seed: int) -> None:
         raise ValueError(f"clip: got {frames.shape[1]} frames with {seed} seed frames, expected more, and a seed")
 
 
-def parse(savi: SAVi, frames: Tensor) -> Tensor:
-    """Slots (B, T, N, D) of clips (B, T, 3, H, W); initial slots that are drawn are the same at every call."""
-    slots: Tensor = savi(frames, generator=torch.Generator(frames.device).manual_seed(0))[0]
-    return slots
-
-
 class SlotVideo:
     """A world model in evaluation mode as a `VideoPredictor`."""
 
@@ -65,10 +59,10 @@ class SlotVideo:
         """See `VideoPredictor`; mode `ground_truth` needs the real actions (B, T - 1, A), else a ValueError."""
         check_clip(frames, seed)
         model = self.model
-        slots = parse(model.savi, frames)
+        slots = model.savi.parse(frames)
         p, v = self._latents(slots, actions)
         if donors is not None:  # moves within the seed stay its own
-            others = self._latents(parse(model.savi, donors), actions)
+            others = self._latents(model.savi.parse(donors), actions)
             p, v = (torch.cat((a[:, : seed - 1], b[:, seed - 1 :]), dim=1) for a, b in zip((p, v), others, strict=True))
         # SAVi is causal: of the true future nothing but latents is handed on.
         predicted = model.predictor.rollout(slots[:, :seed], p, v)[:, seed - 1 :]
@@ -91,7 +85,7 @@ class Reconstruction:
     @torch.no_grad()
     def predict(self, frames: Tensor, seed: int, donors: Tensor | None = None) -> Tensor:  # noqa: ARG002
         check_clip(frames, seed)
-        decoded: Tensor = self.savi.decode(parse(self.savi, frames)[:, seed:]).frames
+        decoded: Tensor = self.savi.decode(self.savi.parse(frames)[:, seed:]).frames
         return decoded
 
 

@@ -95,6 +95,11 @@ class SAVi(nn.Module):
             current = self.transition(corrected)
         return torch.stack(slots, dim=1), current
 
+    def parse(self, frames: Tensor, seed: int = 0) -> Tensor:
+        """Slots (B, T, N, D) of whole clips (B, T, 3, H, W); initial slots that are drawn are the seed's."""
+        slots: Tensor = self(frames, generator=torch.Generator(frames.device).manual_seed(seed))[0]
+        return slots
+
     def _bf16(self, inputs: Tensor) -> bool:
         return in_bf16(inputs.device.type, self.precision)
 

@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 import torch
+from tiny_savi import tiny_savi
 from torch import Tensor
 
 from playslot_rl import keys
@@ -23,7 +24,7 @@ from playslot_rl.acting.planners.torchrl_planning import ReturnAdvantage, latent
 from playslot_rl.api import PlaySlot
 from playslot_rl.modules.whitening import Whitening
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.testing import tiny_agent, tiny_config, tiny_savi
+from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent, WorldModel
 
 

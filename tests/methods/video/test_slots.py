@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.config import LatentMode, PredictorConfig
-from playslot_rl.methods.video.predictor import LastFrame, Reconstruction, SlotVideo, VideoPredictor, parse
+from playslot_rl.methods.video.predictor import LastFrame, Reconstruction, SlotVideo, VideoPredictor
 from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import WorldModel
 
@@ -69,7 +69,7 @@ def test_real_actions_are_asked_for() -> None:
 
 def test_the_ceiling_is_the_reconstruction_of_the_true_frames() -> None:
     savi, frames = model().model.savi, clips()
-    expected = savi.decode(parse(savi, frames)).frames[:, S:]
+    expected = savi.decode(savi.parse(frames)).frames[:, S:]
     torch.testing.assert_close(Reconstruction(savi).predict(frames, S), expected)
 
 
