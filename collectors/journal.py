@@ -26,6 +26,7 @@ from playslot_rl.config import EnvConfig, ExperimentConfig, RenderConfig, from_d
 from playslot_rl.config.plain import flatten, nearest, to_dict
 from playslot_rl.envs import PROCEDURAL, check_task
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError
+from playslot_rl.frames import png
 from playslot_rl.seeds.episodes import EPISODES, LARGEST_SEED, episode_seed
 from playslot_rl.storage.atomic import explain_write_errors, read_json, write_bytes, write_json
 from playslot_rl.storage.locks import locked
@@ -36,7 +37,6 @@ OFFSETS = {"random": 0, "expert": EPISODES // 2}
 SPEC_NAME = "collection.json"
 LOCK_NAME = "lock"
 ARRAYS: Final = ("states", "actions", "rewards", "success")
-PNG_LEVEL: Final = 6  # compression that LeRobot uses for stored images
 
 
 @dataclass(frozen=True)
@@ -135,14 +135,6 @@ class RecordedEpisode:
     actions: npt.NDArray[np.float32]
     rewards: npt.NDArray[np.float32]
     success: npt.NDArray[np.bool_]
-
-
-def png(frame: npt.NDArray[np.uint8]) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", compress_level=PNG_LEVEL)
-    return buffer.getvalue()
 
 
 def encode(episode: RecordedEpisode) -> bytes:

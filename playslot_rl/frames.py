@@ -5,10 +5,16 @@ Shapes: H W frame height and width. Bytes are uint8 [0, 255], numbers float [0, 
 
 from __future__ import annotations
 
+import io
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet's frames, with which torchvision's weights were trained."""
@@ -30,6 +36,16 @@ def psnr(mse: Tensor) -> Tensor:
     1e-8 is added to each, as the authors do: equal frames have 80 dB.
     """
     return -10 * (mse + 1e-8).log10()
+
+
+def png(picture: Image.Image | npt.NDArray[np.uint8], level: int = 6) -> bytes:
+    """A picture (H, W, 3) as the content of a PNG file; compression 6 is that of LeRobot, 1 is quick."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    image = Image.fromarray(picture) if isinstance(picture, np.ndarray) else picture
+    image.save(buffer, format="PNG", compress_level=level)
+    return buffer.getvalue()
 
 
 def to_float(frames: npt.NDArray[np.uint8], device: torch.device | str = "cpu") -> Tensor:

@@ -124,8 +124,8 @@ def _draw(agent: Agent, episodes: list[GoalEpisode], played: Any, folder: Path) 
     import numpy as np
 
     from playslot_rl.evaluation.planning import decoded_plan
+    from playslot_rl.frames import png
     from playslot_rl.storage.atomic import write_bytes
-    from playslot_rl.visualization.grid import png
     from playslot_rl.visualization.planning_page import plan_sheet
 
     plans = [decoded_plan(agent, slots) for slots in played.plans[: len(episodes)]]

@@ -23,11 +23,12 @@ from playslot_rl.data.windows import spread_evenly
 from playslot_rl.datasets.info import info
 from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
+from playslot_rl.frames import png
 from playslot_rl.storage.atomic import write_text
 from playslot_rl.storage.folders import require_outside
 from playslot_rl.visualization.charts import DARK, LIGHT, curve_figure, figure_bytes
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text, to_html
-from playslot_rl.visualization.grid import animation, image_grid, png
+from playslot_rl.visualization.grid import animation, image_grid
 
 FEATURES: Final = {
     keys.FEATURE_STATE: "state of the robot",

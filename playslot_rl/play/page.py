@@ -13,6 +13,7 @@ import numpy.typing as npt
 from nicegui import events, ui
 
 from playslot_rl.errors import PlaySlotError, explain
+from playslot_rl.frames import png
 from playslot_rl.play import pictures
 from playslot_rl.play.controls import ME, Controls
 from playslot_rl.play.pictures import Gallery
@@ -116,11 +117,11 @@ class PlayPage:
             self.chosen = None
         look = session.look()
         self._owner = look.owner
-        found = {"scene": pictures.encode(pictures.with_masks(look, self.chosen) if self.masks else look.frame)}
+        found = {"scene": png(pictures.with_masks(look, self.chosen) if self.masks else look.frame, level=1)}
         beside = session.now.recorded if session.now.true is None else session.now.true
         if beside is not None:
-            found["beside"] = pictures.encode(beside)
-        found["strip"] = pictures.encode(pictures.strip(look, session, self.chosen, GAP))
+            found["beside"] = png(beside, level=1)
+        found["strip"] = png(pictures.strip(look, session, self.chosen, GAP), level=1)
         return found
 
     def _show(self, drawn: dict[str, bytes]) -> None:

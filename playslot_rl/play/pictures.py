@@ -18,6 +18,7 @@ from PIL.ImageColor import getrgb
 from torch import Tensor
 
 from playslot_rl.colours import OKABE_ITO
+from playslot_rl.frames import png
 from playslot_rl.play.session import Look, PlaySession
 from playslot_rl.play.starts import Start
 from playslot_rl.play.timeline import Frame, SceneMoment
@@ -64,13 +65,6 @@ class Gallery:
 def colour_of(slot: int) -> tuple[int, ...]:
     """A slot's colour, the same everywhere."""
     return getrgb(OKABE_ITO[slot % len(OKABE_ITO)])
-
-
-def encode(frame: Frame) -> bytes:
-    """PNG of a frame (H, W, 3), quickly."""
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
 
 
 def with_masks(look: Look, chosen: int | None = None) -> Frame:
@@ -180,9 +174,9 @@ def game(model: WorldModel, steps: int) -> Callable[[], Tensor]:
         for number in range(steps):
             session.press(number % len(session.prototypes), 1.0)
             look = session.look()
-            encode(look.frame)
-            encode(with_masks(look))
-            encode(strip(look, session, None, 4))
+            png(look.frame, level=1)
+            png(with_masks(look), level=1)
+            png(strip(look, session, None, 4), level=1)
         return session.slots.square().mean()
 
     return play

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
-from playslot_rl.collectors.journal import png
 from playslot_rl.errors import DataError
+from playslot_rl.frames import png
 from playslot_rl.play.pictures import session_animation
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.timeline import SceneMoment

@@ -10,11 +10,12 @@ import numpy as np
 from playslot_rl.evaluation.card import RESULT, Card
 from playslot_rl.evaluation.card_lines import EFFECTS, LATENTS, SLOTS, concluded
 from playslot_rl.evaluation.effects import Replayed
+from playslot_rl.frames import png
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.visualization.charts import usage_chart
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.drawings import change_map, draw_slots
-from playslot_rl.visualization.grid import image_grid, png
+from playslot_rl.visualization.grid import image_grid
 from playslot_rl.visualization.sections import ReportInput, chart
 from playslot_rl.world_model import WorldModel
 

@@ -51,12 +51,6 @@ def film_strip(clips: Frames, rows: Sequence[str], columns: int = 8, first: int 
     return image_grid(clips[:, shown], rows, [f"t = {first + t}" for t in shown])
 
 
-def png(picture: Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    picture.save(buffer, format="PNG")
-    return buffer.getvalue()
-
-
 def animation(pictures: list[Image.Image], fps: float = 6.0) -> bytes:
     """Endless APNG of pictures of one size, whose last one stays a little longer; a ValueError for none, or no rate."""
     if not pictures or fps <= 0:

@@ -18,14 +18,14 @@ from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.errors import CheckpointError
 from playslot_rl.evaluation.held_out import first_seed
 from playslot_rl.evaluation.objects import RESULT, parse_clips, seed_frames
-from playslot_rl.frames import to_uint8
+from playslot_rl.frames import png, to_uint8
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.storage.checkpoints import checkpoint_folder
 from playslot_rl.visualization import sections as part
 from playslot_rl.visualization.card_page import card_section
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text, write_document
-from playslot_rl.visualization.grid import film_strip, png
+from playslot_rl.visualization.grid import film_strip
 from playslot_rl.visualization.latents import latent_section
 from playslot_rl.visualization.sections import ReportInput, percent, seconds
 from playslot_rl.world_model import Agent, WorldModel

@@ -13,14 +13,14 @@ from playslot_rl.evaluation.held_out import first_seed
 from playslot_rl.evaluation.objects import SLOTS_RESULT
 from playslot_rl.evaluation.success import POLICY_PROTOCOLS, PROTOCOLS, hardware
 from playslot_rl.evaluation.video import video_metrics
-from playslot_rl.frames import to_float
+from playslot_rl.frames import png, to_float
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.training.logging import History
 from playslot_rl.visualization.charts import DARK, LIGHT, Theme, loss_chart, loss_names, success_chart
 from playslot_rl.visualization.document import Block, Missing, Picture, Section, Table, Text
 from playslot_rl.visualization.drawings import draw_prototypes, draw_slots, run_rollouts
-from playslot_rl.visualization.grid import animation, film_strip, png, side_by_side
+from playslot_rl.visualization.grid import animation, film_strip, side_by_side
 from playslot_rl.world_model import Agent, WorldModel
 
 STAGES = ("slots", "dynamics", "policy")

@@ -20,6 +20,7 @@ from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.evaluation.intervals import hierarchical
 from playslot_rl.evaluation.video import open_lpips
+from playslot_rl.frames import png
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing, write_json, write_text
 from playslot_rl.studies.launch import Status, read_status
@@ -40,7 +41,6 @@ from playslot_rl.studies.video.shared import (
 )
 from playslot_rl.studies.video.training import VideoTraining, beyond, require_begun_alike
 from playslot_rl.visualization.document import to_markdown
-from playslot_rl.visualization.grid import png
 
 METRICS = ("psnr", "ssim", "lpips")
 KIND = ("row", "sees", "clips_of", "seed_frames")
