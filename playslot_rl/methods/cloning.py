@@ -231,14 +231,15 @@ def action_stage(
 def cloning(
     record: StageRecord,
     behaviour: LatentCloning,
-    own: Any,
+    decoder_steps: int,
+    decoder_lr: float,
     at: str = "",
     views: int = 1,
 ) -> Training:
     """Latent policy, then action decoder, then both; the policy is taken over where another run has trained it.
 
-    The decoder has the `decoder_steps` and the `decoder_lr` of `own`, the rest is of the policy's schedule, which is
-    `baselines.METHOD.policy`, or the group `at`.
+    The decoder has its own steps and rate, the rest is of the policy's schedule, which is `baselines.METHOD.policy`, or
+    the group `at`.
     """
     config, name, split, policy = record.config, record.name, record.demos, behaviour.schedule
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
@@ -255,7 +256,7 @@ def cloning(
     def parts() -> Iterator[Part]:
         clone = behaviour.policy_stage()
         yield Part(f"{name}.policy", clone, policy, group=schedule)
-        yield from behaviour.decoding(clone, part, own.decoder_steps, own.decoder_lr)
+        yield from behaviour.decoding(clone, part, decoder_steps, decoder_lr)
 
     said, extra = cloned(name, split, len(behaviour.trained.actions), config.behaviour.labelled_demos, views)
     return Training(

@@ -161,7 +161,7 @@ def model(record: StageRecord) -> Training:
 
 def policy(record: StageRecord) -> Training:
     behaviour = CADDYBehaviour(record.config, record.parents["caddy"], record.demos, record.device)
-    return cloning(record, behaviour, behaviour.own)
+    return cloning(record, behaviour, behaviour.own.decoder_steps, behaviour.own.decoder_lr)
 
 
 def oracle(record: StageRecord) -> Training:

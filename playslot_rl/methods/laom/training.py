@@ -168,4 +168,5 @@ def model(record: StageRecord) -> Training:
 
 
 def policy(record: StageRecord) -> Training:
-    return cloning(record, LAOMBehaviour(record), record.config.baselines.laom)
+    own: LAOMConfig = record.config.baselines.laom
+    return cloning(record, LAOMBehaviour(record), own.decoder_steps, own.decoder_lr)

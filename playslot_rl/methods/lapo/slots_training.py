@@ -91,5 +91,5 @@ class LAPOSlotsBehaviour(LatentCloning):
 
 
 def policy(record: StageRecord) -> Training:
-    behaviour = LAPOSlotsBehaviour(record)
-    return cloning(record, behaviour, record.config.behaviour, "behaviour", len(behaviour.views))
+    behaviour, own = LAPOSlotsBehaviour(record), record.config.behaviour
+    return cloning(record, behaviour, own.decoder_steps, own.decoder_lr, "behaviour", len(behaviour.views))

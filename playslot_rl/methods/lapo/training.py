@@ -180,4 +180,5 @@ def on_pairs(
 
 
 def policy(record: StageRecord) -> Training:
-    return cloning(record, LAPOBehaviour(record), record.config.baselines.lapo)
+    own: LAPOConfig = record.config.baselines.lapo
+    return cloning(record, LAPOBehaviour(record), own.decoder_steps, own.decoder_lr)
