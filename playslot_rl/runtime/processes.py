@@ -20,10 +20,12 @@ import os
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from multiprocessing.context import ForkServerContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -264,7 +266,7 @@ def worker_context(imported: Sequence[str] = IMPORTED) -> ForkServerContext:
     """How workers start: forked from one server, which has the imports, and no thread, GL context or GPU.
 
     The first worker starts as quickly as a fresh process, each further one in tens of milliseconds, and all of them
-    share the memory of the imports. The server ends with this process, and its workers with it (`begin_worker`). A
+    share the memory of the imports. The workers end with this process (`begin_worker`), and the server with them. A
     process has one server, with the imports that were wanted when its first worker started.
     """
     context = multiprocessing.get_context("forkserver")
@@ -284,3 +286,11 @@ def begin_worker() -> None:
     end_with_parent(signal.SIGKILL)
     if sys.platform.startswith("linux") and os.getppid() == 1:  # the parent died before the line above
         os._exit(1)
+    started_by = multiprocessing.parent_process()
+    if started_by is not None:  # not the fork server, which lives as long as a worker does
+        threading.Thread(target=_end_after, args=(started_by,), daemon=True).start()
+
+
+def _end_after(process: BaseProcess) -> None:
+    process.join()
+    os._exit(1)
