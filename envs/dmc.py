@@ -97,10 +97,6 @@ class DMControlTask(PixelTask):
         self._last = self._suite.step(action)
         return float(self._last.reward), False
 
-    def _simulate(self, action: Action) -> tuple[float, bool]:
-        mean, success = super()._simulate(action)
-        return mean * self.config.frame_skip, success
-
     def _solved(self) -> bool:
         return False
 

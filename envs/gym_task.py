@@ -5,152 +5,53 @@ Shapes: A = numbers of the Box, S = numbers of the environment's own observation
 
 from __future__ import annotations
 
-import difflib
-import functools
 import importlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, Final
 
-import farama_notifications
-import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.config.plain import nearest
+from playslot_rl.envs.gym_facts import SUCCESS, facts, first_steps, flat, open_env, picture
+from playslot_rl.envs.gym_scene import Scene, view
 from playslot_rl.envs.pixel_task import Action, Frame, PixelTask
-from playslot_rl.envs.rendering import Camera, FrameRenderer, box_sized, import_mujoco
+from playslot_rl.envs.rendering import FrameRenderer, box_sized
 from playslot_rl.errors import ConfigError, first_line
 
 Expert = Callable[[Any, dict[str, Any], np.random.Generator], npt.ArrayLike]
 """`env.expert`: of the environment's own observation and info, and a generator that is a function of the episode's
 seed and of the step, the action in the environment's own units, (A,)."""
 
-SUCCESS: Final = ("is_success", "success")
-"""Entries of info that say whether a step solved the task."""
 EXPERT_STREAM: Final = 4
 ROUNDING: Final = 1e-5
 """By how much an expert's action may lie outside of [-1, 1]."""
-NUMBERS: Final = "distance,azimuth,elevation,x,y,z"
-
-
+SEED_BITS: Final = 32
+"""Of the seeds that any environment takes: numpy's older generator refuses longer ones."""
 NO_EXPERT: Final = (
     "env.expert: got nothing with env.id={}, expected package.module:function "
     "(observation, info, generator -> action), or policy=random"
 )
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What an environment says of itself: widths of action and observation, the entry of info that says success (empty
-    where there is none), environment steps a second, and whether MuJoCo knows its parts.
+def fitted(env: EnvConfig) -> dict[str, int]:
+    """What the environment itself says of `EnvConfig`: the width of its actions and, where it has one, its limit of
+    steps; a ConfigError where environment or expert are none.
     """
-
-    actions: int
-    state: int
-    success: str
-    hz: float
-    parts: bool
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Warnings of old versions and missing bounds, and what is printed at an import, are about others' code."""
-    farama_notifications.notifications.pop("gymnasium_robotics", None)
-    before, gym.logger.min_level = gym.logger.min_level, gym.logger.ERROR
-    try:
-        yield
-    finally:
-        gym.logger.min_level = before
-
-
-def _open(name: str) -> gym.Env[Any, Any]:
-    """The environment of a Gymnasium id, without a limit of steps; a ConfigError where it is none that we can use."""
-    import_mujoco()
-    if not name:
-        raise ConfigError("env.id: got nothing with env=gym, expected a Gymnasium id, such as env.id=FetchReach-v4")
-    with _quiet():
-        import gymnasium_robotics
-
-        gym.register_envs(gymnasium_robotics)
-        try:
-            env: gym.Env[Any, Any] = gym.make(
-                name, max_episode_steps=-1, render_mode="rgb_array", disable_env_checker=True
-            )
-        except gym.error.UnregisteredEnv as error:
-            near = ", ".join(difflib.get_close_matches(name, [*gym.registry], n=3, cutoff=0.0))
-            raise ConfigError(f"env.id: got {name!r}, expected a registered id; the nearest are {near}") from error
-        except Exception as error:  # whatever a foreign environment does when it is made
-            raise ConfigError(
-                f"env.id={name}: got {type(error).__name__} ({first_line(error)}), expected an environment that can be "
-                "made: install what it needs, or choose another"
-            ) from error
-    space, modes, said = env.action_space, env.metadata.get("render_modes") or (), ""
-    if not isinstance(space, gym.spaces.Box) or space.dtype.kind != "f":
-        said = f"got actions {space}, expected a Box of real numbers"
-    elif not space.is_bounded("both"):
-        said = f"got actions {space}, expected bounds below and above"
-    elif "rgb_array" not in modes:
-        said = f"got render_modes {list(modes)}, expected rgb_array among them"
-    if said:
-        env.close()
-        raise ConfigError(f"env.id={name}: {said}; choose another environment, or wrap it under an id of your own")
-    return env
-
-
-def flat(observation: Any) -> npt.NDArray[np.float32]:
-    """An observation's numbers in one row, float32 (S,), pictures left out; one zero where there are none."""
-    rows = [np.ravel(part) for part in _parts(observation) if part.ndim < 2]
-    return np.concatenate(rows).astype(np.float32) if rows else np.zeros(1, np.float32)
-
-
-def _parts(observation: Any) -> Iterator[npt.NDArray[Any]]:
-    if isinstance(observation, dict):
-        for part in observation.values():
-            yield from _parts(part)
-    else:
-        yield np.asarray(observation)
-
-
-@functools.cache
-def facts(name: str) -> Facts:
-    """Found by one step of an episode: what an environment's info holds is declared nowhere."""
-    env = _open(name)
-    try:
-        observation, _ = env.reset(seed=0)
-        box: Any = env.action_space
-        info = env.step(((box.low + box.high) / 2).astype(box.dtype))[4]
-        parts = _is_mujoco(env)
-        if not parts:
-            _picture(env, name)
-    finally:
-        env.close()
-    success, hz = next((key for key in SUCCESS if key in info), ""), float(env.metadata.get("render_fps") or 10)
-    return Facts(int(np.prod(box.shape)), len(flat(observation)), success, hz, parts)
-
-
-def _is_mujoco(env: gym.Env[Any, Any]) -> bool:
-    return isinstance(getattr(env.unwrapped, "model", None), import_mujoco().MjModel)
-
-
-def _picture(env: gym.Env[Any, Any], name: str) -> Frame:
-    """What an environment draws; a ConfigError where that is no picture."""
-    picture: Any = env.render()
-    if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.dtype != np.uint8:
-        got = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
-        raise ConfigError(f"env.id={name}: got {got} from render(), expected a picture, uint8 (H, W, 3)")
-    return picture
-
-
-def fitted(env: EnvConfig) -> EnvConfig:
-    """`env` with the width of its environment's actions; a ConfigError where environment or expert are none."""
     if env.expert:
         load_expert(env.expert)
-    return replace(env, action_dim=facts(env.id).actions)
+    known = facts(env.id)
+    steps = {"max_steps": max(2, -(-known.steps // env.frame_skip))} if known.steps else {}
+    return {"action_dim": known.actions, **steps}
+
+
+def short_seed(number: int) -> int:
+    """An episode's number as any environment takes it: itself below 2^32, else 32 bits mixed from all of its own.
+
+    Note: not the remainder, by which a test's episodes would be those of a collection.
+    """
+    return number if number < 2**SEED_BITS else int(np.random.SeedSequence(number).generate_state(1)[0])
 
 
 def load_expert(name: str) -> Expert:
@@ -190,52 +91,11 @@ def check_expert(env: EnvConfig) -> None:
 
 def require_success(env: EnvConfig) -> None:
     """A ConfigError where an environment's info says nothing of success."""
-    if not facts(env.id).success:
+    if not (env.success or facts(env.id).success):
         raise ConfigError(
             f"env.id={env.id}: got an environment whose info says no success, expected {' or '.join(SUCCESS)} in it: "
-            "`evaluate` and `compare` measure its return"
+            "name another entry (env.success=), or `evaluate` and `compare` measure its return"
         )
-
-
-def _view(env: gym.Env[Any, Any], model: Any, camera: str) -> tuple[Any, bool]:
-    """What a `FrameRenderer` looks through, and whether it is at rest: a camera of the model by its name, a free one by
-    its numbers, or with no words the one that the environment itself draws with.
-    """
-    mj = import_mujoco()
-    names = [model.camera(i).name for i in range(model.ncam)]
-    if not camera:
-        holders = (env, *vars(env).values())
-        own = next((h.mujoco_renderer for h in holders if hasattr(h, "mujoco_renderer")), None)
-        number = getattr(own, "camera_id", -1)
-        if number is not None and number >= 0:
-            camera = names[number]
-        else:
-            return _free(mj, model, env, getattr(own, "default_cam_config", None) or {}), True
-    if camera in names:
-        at_rest = model.cam_mode[names.index(camera)] == mj.mjtCamLight.mjCAMLIGHT_FIXED
-        return camera, bool(at_rest and model.cam_bodyid[names.index(camera)] == 0)
-    try:
-        distance, azimuth, elevation, x, y, z = (float(part) for part in camera.split(","))
-    except ValueError:
-        hint = nearest(camera, names, "env.camera=")
-        raise ConfigError(
-            f"env.camera: got {camera!r}, expected {NUMBERS} or one of {', '.join(names) or 'no names'}{hint}"
-        ) from None
-    return Camera(distance, azimuth, elevation, (x, y, z)), True
-
-
-def _free(mj: Any, model: Any, env: Any, settings: dict[str, Any]) -> Any:
-    """Gymnasium's free camera: it looks at the middle of the geoms from as far as the scene is wide, or as it says."""
-    view = mj.MjvCamera()
-    view.lookat[:] = np.median(env.data.geom_xpos, axis=0)
-    view.distance = model.stat.extent
-    for name, value in settings.items():
-        if isinstance(value, np.ndarray):
-            getattr(view, name)[:] = value
-        else:
-            setattr(view, name, value)
-    view.type, view.fixedcamid = mj.mjtCamera.mjCAMERA_FREE, -1
-    return view
 
 
 class GymTask(PixelTask):
@@ -244,7 +104,7 @@ class GymTask(PixelTask):
     Actions in [-1, 1] are stretched over its Box. `state_vector` is its own observation without pictures. MuJoCo's are
     drawn by `FrameRenderer`; others draw themselves, and their frames are area-averaged. One that ends early rests
     where it ended, without reward. `info["success"]` is what its own info says; where that says nothing (`solves`
-    False) it is false, and evaluations measure the return. Its `reset(seed=)` gets the episode's seed.
+    False) it is false, and evaluations measure the return. Its `reset(seed=)` gets the episode's `short_seed`.
     """
 
     scenery = False
@@ -271,29 +131,43 @@ class GymTask(PixelTask):
         config = env or EnvConfig("gym")
         known = facts(config.id)
         super().__init__(config, render_mode, actions=known.actions, state=known.state)
-        self.metadata, self.solves, self._success = self.metadata_of(config), bool(known.success), known.success
-        self.has_expert = bool(config.expert)
+        self.metadata, self._success = self.metadata_of(config), config.success or known.success
+        self.solves, self.has_expert = bool(self._success), bool(config.expert)
         self._expert = load_expert(config.expert) if config.expert else None
-        self.inner = _open(config.id)
-        core: Any = self.inner.unwrapped
-        self._simulation = SimpleNamespace(
-            model=getattr(core, "model", None), data=getattr(core, "data", None), close=self.inner.close
-        )
-        self._mujoco = known.parts
+        self.inner = open_env(config.id)
+        self._simulation = Scene(self.inner)
+        self._mujoco, self._render, self._view = known.parts, render or RenderConfig(), None
         if self._mujoco:
-            self.inner.reset(seed=0)  # a camera over the middle of the scene is over what the first episode shows
-            view, at_rest = _view(core, self._simulation.model, config.camera)
-            self.distance_seen = float(getattr(view, "distance", self._simulation.model.stat.extent / 2))
-            self._make_renderer = partial(
-                FrameRenderer, self._simulation.model, view, config.image_size, render or RenderConfig(),
-                at_rest=at_rest,
-            )  # fmt: skip
+            with first_steps(config.id):
+                self.inner.reset(seed=0)  # a camera over the middle of the scene is over what the first episode shows
+            self._aim()
         elif config.camera:
             raise ConfigError(f"env.camera: got {config.camera!r}, expected none: {config.id} draws itself")
         self._observation: Any = None
         self._info: dict[str, Any] = {}
         self._over = False
         self._moment = 0
+
+    def _aim(self) -> None:
+        """Have what draws look at the present model, a free camera always from the same place."""
+        self._drawn = self._simulation.model
+        found, at_rest = view(self._simulation.core, self._drawn, self.config.camera)
+        self._view = found if self._view is None else self._view
+        self.distance_seen = float(getattr(self._view, "distance", self._drawn.stat.extent / 2))
+        self._make_renderer = partial(
+            FrameRenderer, self._drawn, self._view, self.config.image_size, self._render, at_rest=at_rest
+        )
+
+    def _redraw(self) -> None:
+        """Make what draws anew where the environment has made another model."""
+        if not self._mujoco or self._simulation.model is self._drawn:
+            return
+        self._aim()
+        if "_renderer" in self.__dict__:
+            self.__dict__.pop("_renderer").close()
+            self._variation = None
+            self.open_renderer()
+            self._vary()
 
     def open_renderer(self) -> None:
         if self._mujoco:
@@ -302,7 +176,7 @@ class GymTask(PixelTask):
     def draw(self) -> Frame:
         if self._mujoco:
             return super().draw()
-        return box_sized(_picture(self.inner, self.config.id), self.config.image_size)
+        return box_sized(picture(self.inner, self.config.id), self.config.image_size)
 
     def _placed(self) -> None:
         """What an environment moves only to draw it, such as a goal's mark, moves in every step: it may touch the
@@ -310,16 +184,17 @@ class GymTask(PixelTask):
         callback = getattr(self.inner.unwrapped, "_render_callback", None)
         if self._mujoco and callback is not None:
             callback()
+        self._redraw()
 
     def _begin(self, rng: np.random.Generator) -> None:
         del rng
-        self._observation, self._info = self.inner.reset(seed=self.episode)
+        self._observation, self._info = self.inner.reset(seed=short_seed(self.episode))
         self._over, self._moment = False, 0
         self._placed()
 
     def _advance(self, action: Action) -> tuple[float, bool]:
         if self._over:
-            return 0.0, False
+            return 0.0, self._solved()
         box: Any = self.inner.action_space
         plain = (box.low == -1).all() and (box.high == 1).all()
         spread = action.reshape(box.shape) if plain else self._spread(action)
@@ -360,7 +235,9 @@ class GymTask(PixelTask):
             raise ConfigError(
                 f"env.expert={self.config.expert}: got {given!r}, expected {self.config.action_dim} finite numbers"
             )
-        scaled = 2 * (given.reshape(box.shape) - box.low) / (box.high.astype(np.float64) - box.low) - 1
+        given, wide = given.reshape(box.shape), box.high > box.low
+        width = np.where(wide, box.high.astype(np.float64) - box.low, 1.0)
+        scaled = np.where(wide, 2 * (given - box.low) / width - 1, 2.0 * ~np.isclose(given, box.low))
         if np.abs(scaled).max() > 1 + ROUNDING:
             raise ConfigError(f"env.expert={self.config.expert}: got {given!r}, expected it in {box}: clip it there")
         clipped: Action = np.clip(scaled.ravel(), -1.0, 1.0).astype(np.float32)

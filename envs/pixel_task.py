@@ -130,6 +130,11 @@ class PixelTask(gym.Env[Observation, Action]):
         """Make the GL context now, not with the first episode; a RenderError where there is none."""
         assert self._renderer is not None
 
+    def _vary(self) -> None:
+        """Draw how the episode varies."""
+        if self._variation is not None:
+            self._variation.begin(self.episode, self._renderer.side)
+
     @abstractmethod
     def _begin(self, rng: np.random.Generator) -> None:
         """Put the simulation into a new episode, drawn from `rng`."""
@@ -151,13 +156,14 @@ class PixelTask(gym.Env[Observation, Action]):
         raise without_expert(self.config)
 
     def _simulate(self, action: Action) -> tuple[float, bool]:
-        """One agent step: its mean reward, and whether any of its environment steps solved the task."""
+        """One agent step: its mean reward, and whether any of its environment steps solved the task. Where returns are
+        measured, it is their sum: these must not depend on `frame_skip`."""
         reward, success = 0.0, False
         for _ in range(self.config.frame_skip):
             step_reward, solved = self._advance(action)
             reward += step_reward
             success |= solved
-        return reward / self.config.frame_skip, success
+        return reward / self.config.frame_skip if self.solves else reward, success
 
     def draw(self) -> Frame:
         """Draw the present state anew: uint8 (H, W, 3). `render` returns the frame that was last observed."""
@@ -212,8 +218,7 @@ class PixelTask(gym.Env[Observation, Action]):
         self.episode = int(self.np_random.integers(2**31)) if seed is None else seed
         task, warmup = (np.random.default_rng(s) for s in np.random.SeedSequence(self.episode).spawn(2))
         self._begin(task)
-        if self._variation is not None:
-            self._variation.begin(self.episode, self._renderer.side)
+        self._vary()
         for _ in range(self.config.warmup_steps):
             self._simulate(warmup.uniform(-1.0, 1.0, self.action_space.shape).astype(np.float32))
         self._steps = 0

@@ -122,7 +122,7 @@ def box_sized(picture: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8
 
 
 class FrameRenderer:
-    """Draws the scene of one MuJoCo model from a viewpoint, or a camera of the model, by its name; of one that is
+    """Draws the scene of one MuJoCo model from a viewpoint, or a camera of the model, by name or number; of one that is
     `at_rest` in the world, and of `still` parts, which never move, `fast` draws only what it can see, and no details of
     meshes under `cell` metres. A RenderError without a GL backend.
     """
@@ -130,7 +130,7 @@ class FrameRenderer:
     def __init__(
         self,
         model: mujoco.MjModel,
-        camera: Camera | str | mujoco.MjvCamera,
+        camera: Camera | str | int | mujoco.MjvCamera,
         size: int,
         config: RenderConfig,
         still: Still | None = None,
@@ -161,7 +161,7 @@ class FrameRenderer:
             for flag in (mj.mjtRndFlag.mjRND_SHADOW, mj.mjtRndFlag.mjRND_REFLECTION):
                 self._renderer.scene.flags[flag] = 0
         self._variation: Variation | None = None
-        self._model, self._number = model, model.camera(camera).id if isinstance(camera, str) else -1
+        self._model, self._number = model, model.camera(camera).id if isinstance(camera, str | int) else -1
         self._camera: Any = camera
         if isinstance(camera, Camera):
             self._camera = view = mj.MjvCamera()

@@ -14,6 +14,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import yaml
@@ -111,10 +112,10 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         if continues:
             config = _from_run(Path(run), pairs, command == "play")
         else:
-            base = _presets(pairs.get("env", PLAIN_ENV), pairs.get("preset", PRESET))
-            config = from_dict(ExperimentConfig, _with_task(base, _typed(pairs)))
-            if config.env.id and "env.action_dim" not in pairs:  # only the environment knows
-                config = dataclasses.replace(config, env=plugins.call(FITTED, config.env))
+            values, typed = _presets(pairs.get("env", PLAIN_ENV), pairs.get("preset", PRESET)), _typed(pairs)
+            config = from_dict(ExperimentConfig, _with_task(values, typed))
+            if config.env.id and not {"env.action_dim", "env.max_steps"} <= pairs.keys():  # only the environment knows
+                config = from_dict(ExperimentConfig, _with_task(values, typed, plugins.call(FITTED, config.env)))
         require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
         require_read(config, flatten(_typed(pairs)), command)
     except ConfigError:
@@ -293,11 +294,15 @@ def _presets(env: str, preset: str) -> dict[str, Any]:
     return values if task is None else merged(values, {"env": to_dict(task.env), "model": dict(task.model)})
 
 
-def _with_task(values: dict[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
-    """What a preset says, changed by how long its task lasts, and then by what was typed."""
-    env = merged(values["env"], typed.get("env", {}))
+def _with_task(
+    values: dict[str, Any], typed: Mapping[str, Any], fitted: Mapping[str, Any] = MappingProxyType({})
+) -> dict[str, Any]:
+    """What a preset says, changed by what the environment itself says and how long its task lasts, and then by what was
+    typed."""
+    env = merged(merged(values["env"], fitted), typed.get("env", {}))
     own = preset_values(env, values["preset"], values["dynamics"]["predicted_frames"], plugins.brought(TASKS_GROUP))
-    return merged(merged(values, own), typed)
+    width = {"env": {"action_dim": fitted["action_dim"]}} if fitted else {}
+    return merged(merged(merged(values, width), own), typed)
 
 
 def _typed(pairs: Mapping[str, str]) -> dict[str, Any]:

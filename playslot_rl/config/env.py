@@ -156,6 +156,7 @@ class EnvConfig(Checked):
         camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
         expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
             to its action.
+        success: of `env=gym`: the entry of its info that says success; empty is `is_success` or `success`.
         task: which task of `metaworld`: `drawer-open`, another of its fifty, or several by the episode, `MT10` or
             `reach+push`; of `ogbench`: `cube-single` or `cube-double`.
         goals: of `ogbench`: its five of `evaluation`, in turn, or `random` ones one after the other, as in its data.
@@ -175,6 +176,7 @@ class EnvConfig(Checked):
     id: str = field(default="", metadata=UNSAID)
     camera: str = field(default="", metadata=UNSAID)
     expert: str = field(default="", metadata=UNSAID)
+    success: str = field(default="", metadata=UNSAID)
     task: str = field(default="", metadata=UNSAID)
     goals: Literal["evaluation", "random"] = field(default="evaluation", metadata=UNSAID)
     targets: bool = field(default=True, metadata=UNSAID)
@@ -227,7 +229,7 @@ class EnvConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key in ("id", "camera", "expert"):
+        for key in ("id", "camera", "expert", "success"):
             value = getattr(self, key)
             check(self.name == "gym" or not value, f"env.{key}", value, f"none with env={self.name}: it is of env=gym")
         drawn = self.name not in ("grid_shapes", "sketchy", "video") or not self.variation.on

@@ -2,38 +2,57 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from playslot_rl.envs.rendering import import_mujoco
+
 GOAL = 3.0
 
 
 class Line(gym.Env[Any, Any]):
-    """A dot on a line draws itself, 20 x 40 pixels; actions from -2 to 4; its info says nothing of success."""
+    """A dot on a line draws itself, 20 x 40 pixels; actions from -2 to 4. Seeds have 32 bits, as of old. Its info says
+    nothing of success, or in the last step alone, by the name that `says` gives.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
     observation_space = gym.spaces.Box(-10, 10, (1,), np.float64)
 
     def __init__(
-        self, render_mode: str | None = None, space: Any = None, modes: Any = None, picture: Any = None
+        self,
+        render_mode: str | None = None,
+        space: Any = None,
+        modes: Any = None,
+        picture: Any = None,
+        says: str = "",
+        fails: str = "",
     ) -> None:
         self.render_mode, self.picture, self.taken = render_mode, picture, np.zeros(0)
+        self.says, self.fails = says, fails
         self.action_space = gym.spaces.Box(-2.0, 4.0, (1,), np.float32) if space is None else space
         self.metadata = {**self.metadata, **({} if modes is None else {"render_modes": modes})}
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.place = float(self.np_random.uniform(-1, 1))
+        self._fail("reset")
+        self.place = float(np.random.RandomState(seed).uniform(-1, 1))
         return np.array([self.place]), {}
 
     def step(self, action: Any) -> Any:
+        self._fail("step")
         self.taken = np.asarray(action)
         self.place += 0.1 * float(self.taken[0])
-        return np.array([self.place]), 1.0, self.place > GOAL, False, {}
+        over = self.place > GOAL
+        return np.array([self.place]), 1.0, over, False, {self.says: True} if self.says and over else {}
+
+    def _fail(self, where: str) -> None:
+        if self.fails == where:
+            raise RuntimeError("no licence\nask for one")
 
     def render(self) -> Any:
+        self._fail("render")
         if self.picture is not None:
             return self.picture
         frame = np.zeros((20, 40, 3), np.uint8)
@@ -41,10 +60,48 @@ class Line(gym.Env[Any, Any]):
         return frame
 
 
-def register(name: str, **kwargs: Any) -> str:
-    """A `Line` under an id of its own."""
+class Ball(gym.Env[Any, Any]):
+    """A ball on a plane of MuJoCo, whose model or data (`anew`) are made anew in each reset, seen freely or through a
+    camera that has no name.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    observation_space = gym.spaces.Box(-9, 9, (1,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, render_mode: str | None = None, anew: str = "", camera: int = -1) -> None:
+        self.render_mode, self.anew, self.mujoco_renderer = render_mode, anew, SimpleNamespace(camera_id=camera)
+        self._make(0.0)
+
+    def _make(self, place: float) -> None:
+        mj = import_mujoco()
+        self.model = mj.MjModel.from_xml_string(
+            f"""<mujoco><worldbody><light pos='0 0 3'/><geom type='plane' size='1 1 .1' rgba='.4 .4 .4 1'/>
+            <camera pos='0 -2 1.5' euler='55 0 0'/><body name='ball' pos='{place} 0 .3'>
+            <joint type='slide' axis='1 0 0'/><geom size='.2' rgba='1 0 0 1'/></body></worldbody></mujoco>"""
+        )
+        self.data = mj.MjData(self.model)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        place, mj = float(self.np_random.uniform(-0.6, 0.6)), import_mujoco()
+        if self.anew == "model":
+            self._make(place)
+        else:
+            self.data = mj.MjData(self.model)
+            self.data.qpos[0] = place
+        mj.mj_forward(self.model, self.data)
+        return self.data.body("ball").xpos[:1].copy(), {}
+
+    def step(self, action: Any) -> Any:
+        import_mujoco().mj_step(self.model, self.data)
+        return self.data.body("ball").xpos[:1].copy(), 0.0, False, False, {}
+
+
+def register(name: str, made: type[gym.Env[Any, Any]] = Line, limit: int | None = None, **kwargs: Any) -> str:
+    """An environment under an id of its own, with a limit of steps."""
     if name not in gym.registry:
-        gym.register(name, entry_point=Line, kwargs=kwargs)
+        gym.register(name, entry_point=made, max_episode_steps=limit, kwargs=kwargs)
     return name
 
 
@@ -71,6 +128,11 @@ def of_one(observation: Any) -> Any:
 
 def forgetful(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:
     return info["goal"]
+
+
+def of_two(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:
+    """For a Box whose second number is always 1."""
+    return np.array([1.0, 1.0])
 
 
 def in_words(observation: Any, info: dict[str, Any], generator: np.random.Generator) -> Any:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import gym_examples
 import gymnasium as gym
@@ -18,8 +19,10 @@ from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.config.env import VariationConfig
 from playslot_rl.envs import check_task, make_env, task_metadata
-from playslot_rl.envs.gym_task import GymTask
+from playslot_rl.envs.gym_facts import facts, flat
+from playslot_rl.envs.gym_task import GymTask, short_seed
 from playslot_rl.errors import ConfigError
+from playslot_rl.seeds.episodes import Stream, episode_seed
 
 ROBOTS = {"FetchReach-v4": 4, "PointMaze_UMaze-v3": 2, "AdroitHandDoor-v1": 28}
 LINE = gym_examples.register("Line-v0")
@@ -164,6 +167,9 @@ UNBOUNDED = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
         (["env.id=LineBlind-v0"], r"got render_modes \['human'\], expected rgb_array among them"),
         (["env.id=LineBroken-v0"], "expected an environment that can be made"),
         (["env.id=LineGrey-v0"], r"got float64 \(4, 4\) from render\(\), expected a picture"),
+        (["env.id=LineReset-v0"], r"got RuntimeError \(no licence\), expected .* whose first reset, steps and picture"),
+        (["env.id=LineStep-v0"], "env.id=LineStep-v0: got RuntimeError .* work: mend it, install what it needs"),
+        (["env.id=LineRender-v0"], r"env\.id=LineRender-v0: got RuntimeError"),
         ([f"env.id={LINE}", "env.expert=gym_examples:nobody"], "env.expert: got 'gym_examples:nobody'"),
         ([f"env.id={LINE}", "env.expert=gym_examples:NOTHING"], "no function"),
     ],
@@ -174,6 +180,8 @@ def test_what_cannot_be_a_task_is_refused_in_one_line(given: list[str], message:
     gym_examples.register("LineBlind-v0", modes=["human"])
     gym_examples.register("LineBroken-v0", unknown=1)
     gym_examples.register("LineGrey-v0", picture=np.zeros((4, 4)))
+    for where in ("reset", "step", "render"):
+        gym_examples.register(f"Line{where.title()}-v0", fails=where)
     with pytest.raises(ConfigError, match=message) as caught:
         compose(["env=gym", *given])
     assert "\n" not in str(caught.value)
@@ -234,6 +242,130 @@ def test_episodes_are_recorded_as_long_as_they_are_evaluated() -> None:
     typed = ("env.max_steps=30", "collect.random_steps=7", "model.predictor.context=9")
     config = compose(["env=gym", f"env.id={LINE}", *typed])
     assert (config.collect.random_steps, config.collect.expert_steps, config.model.predictor.context) == (7, 30, 9)
+
+
+def test_without_a_typed_length_episodes_are_as_long_as_those_of_the_environment() -> None:
+    name = gym_examples.register("LineShort-v0", limit=30)
+    for typed, steps in (
+        ((), 30),
+        (("env.frame_skip=4",), 8),
+        (("env.max_steps=12",), 12),
+        (("env.action_dim=1",), 30),
+        (("preset=smoke",), 6),
+    ):
+        config = compose(["env=gym", f"env.id={name}", *typed])
+        assert (config.env.max_steps, config.collect.random_steps, config.env.action_dim) == (steps, steps, 1)
+
+
+def test_a_return_does_not_shrink_with_the_length_of_an_agent_step() -> None:
+    """Where success is measured rewards stay means."""
+    late = gym_examples.register("LineLate-v0", says="is_success")
+    for name, reward in ((LINE, 4.0), (late, 1.0)):
+        task = made(line(id=name, frame_skip=4))
+        task.reset(seed=0)
+        assert task.step(np.zeros(1, np.float32))[1] == reward
+        task.close()
+
+
+@pytest.mark.parametrize(("name", "says", "typed"), [("LineLate-v0", "is_success", ""), ("LineTold-v0", "won", "won")])
+def test_success_may_be_said_in_the_last_step_alone(name: str, says: str, typed: str) -> None:
+    config = line(id=gym_examples.register(name, says=says), success=typed, max_steps=20)
+    check_task(config, success=True)
+    task = made(config)
+    assert task.reset(seed=0)[1] == {"success": False}
+    said = [task.step(np.ones(1, np.float32))[4]["success"] for _ in range(12)]
+    assert said == sorted(said)
+    assert said[0] is False
+    assert said[-1] is True
+    task.close()
+    with pytest.raises(ConfigError, match=r"name another entry \(env\.success=\)"):
+        check_task(line(id=gym_examples.register("LineTold-v0", says="won")), success=True)
+
+
+def test_each_stream_has_its_own_short_seeds() -> None:
+    numbers = [
+        episode_seed(stream, seed, index)
+        for stream in get_args(Stream)
+        for seed in (0, 1, 294, 999, 1000, 4242, 2**31, 2**31 + 1, 2**32 - 1)
+        for index in range(30)
+    ]
+    short = [short_seed(number) for number in numbers]
+    assert len({*short}) == len({*numbers}) == len(numbers)
+    assert max(short) < 2**32
+    assert [short_seed(number) for number in (0, 2**32 - 1)] == [0, 2**32 - 1]
+    task = made(line())
+    task.reset(seed=max(numbers))
+    task.close()
+
+
+@pytest.mark.parametrize("camera", [-1, 0], ids=["free", "unnamed"])
+@pytest.mark.parametrize("anew", ["data", "model"])
+def test_model_and_data_may_be_made_anew_in_each_reset(anew: str, camera: int) -> None:
+    """Frames, parts and places are those of the episode, whichever came before."""
+    name = gym_examples.register(f"Ball{anew}{camera}-v0", gym_examples.Ball, anew=anew, camera=camera)
+    task, frames, places, columns = made(line(id=name, variation=VariationConfig(light=0.5))), [], [], []
+    for seed in (1, 2, 1):
+        observation, _ = task.reset(seed=seed)
+        frames.append(observation["pixels"])
+        places.append(task.places()["body1"][0])
+        assert places[-1] == pytest.approx(observation[keys.STATE][0])
+        columns.append(np.nonzero(task.segment() == 1)[1].mean())
+    assert (columns[1] - columns[0]) / (places[1] - places[0]) > 10  # pixels a metre
+    assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
+    np.testing.assert_array_equal(frames[0], frames[2])
+    task.close()
+
+
+@pytest.mark.parametrize("camera", ["nan,1,1,0,0,0", "0,1,1,0,0,0", "1,inf,1,0,0,0", "1,2,3"])
+def test_a_free_camera_is_six_finite_numbers(camera: str) -> None:
+    name = gym_examples.register("Ball-v0", gym_examples.Ball)
+    with pytest.raises(ConfigError, match=rf"got '{camera}', expected distance,.* \(finite, distance above 0\)"):
+        check_task(line(id=name, camera=camera))
+
+
+def test_an_expert_may_act_in_a_box_that_leaves_one_number_no_choice() -> None:
+    space = gym.spaces.Box(np.array([-2, 1], np.float32), np.array([4, 1], np.float32))
+    config = line(id=gym_examples.register("LineNarrow-v0", space=space), action_dim=2, expert="gym_examples:of_two")
+    task = made(config)
+    task.reset(seed=0)
+    action = task.expert_action()
+    np.testing.assert_array_equal(action, [0, 0])
+    task.step(action)
+    np.testing.assert_array_equal(task.inner.unwrapped.taken, [1, 1])  # type: ignore[attr-defined]
+    task.close()
+    off = gym.spaces.Box(np.array([-2, 0], np.float32), np.array([4, 0], np.float32))
+    with pytest.raises(ConfigError, match="expected it in Box"):
+        check_task(replace(config, id=gym_examples.register("LineNarrowOff-v0", space=off)), expert=True)
+
+
+@pytest.mark.parametrize(
+    ("observation", "numbers"),
+    [
+        ((np.zeros(2), [np.ones(3), 1.0]), 6),
+        ({"place": [0.5], "mission": "go there"}, 1),
+        (np.zeros((4, 4)), 16),
+        (np.zeros(128, np.uint8), 128),
+        ({"grey": np.ones((8, 8), np.uint8), "colours": np.ones((8, 8, 3), np.float32), "place": np.ones(2)}, 2),
+    ],
+)
+def test_an_observation_is_its_numbers(observation: Any, numbers: int) -> None:
+    assert flat(observation).shape == (numbers,)
+
+
+@pytest.mark.parametrize("channels", [1, 4])
+def test_grey_and_transparent_pictures_are_frames(channels: int) -> None:
+    picture = np.full((40, 40, channels), 7, np.uint8)
+    task = made(line(id=gym_examples.register(f"Line{channels}-v0", picture=picture)))
+    np.testing.assert_array_equal(task.reset(seed=0)[0]["pixels"], np.full((32, 32, 3), 7))
+    task.close()
+
+
+def test_who_draws_no_squares_is_warned() -> None:
+    with pytest.warns(RuntimeWarning, match="got pictures of 40 x 20 pixels, expected square ones"):
+        facts(gym_examples.register("LineWide-v0"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        facts(gym_examples.register("LineSquare-v0", picture=np.zeros((30, 40, 3), np.uint8)))
 
 
 def test_its_keys_are_its_own() -> None:
