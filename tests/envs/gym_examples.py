@@ -62,7 +62,7 @@ class Line(gym.Env[Any, Any]):
 
 class Ball(gym.Env[Any, Any]):
     """A ball on a plane of MuJoCo, whose model or data (`anew`) are made anew in each reset, seen freely or through a
-    camera that has no name.
+    camera that has no name. In a model of its own the ball is the redder the farther right it is.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
@@ -75,10 +75,11 @@ class Ball(gym.Env[Any, Any]):
 
     def _make(self, place: float) -> None:
         mj = import_mujoco()
+        colour = f"{0.5 + place / 1.2} 0 {0.5 - place / 1.2} 1"
         self.model = mj.MjModel.from_xml_string(
             f"""<mujoco><worldbody><light pos='0 0 3'/><geom type='plane' size='1 1 .1' rgba='.4 .4 .4 1'/>
             <camera pos='0 -2 1.5' euler='55 0 0'/><body name='ball' pos='{place} 0 .3'>
-            <joint type='slide' axis='1 0 0'/><geom size='.2' rgba='1 0 0 1'/></body></worldbody></mujoco>"""
+            <joint type='slide' axis='1 0 0'/><geom size='.2' rgba='{colour}'/></body></worldbody></mujoco>"""
         )
         self.data = mj.MjData(self.model)
 

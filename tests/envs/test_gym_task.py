@@ -303,15 +303,18 @@ def test_each_stream_has_its_own_short_seeds() -> None:
 def test_model_and_data_may_be_made_anew_in_each_reset(anew: str, camera: int) -> None:
     """Frames, parts and places are those of the episode, whichever came before."""
     name = gym_examples.register(f"Ball{anew}{camera}-v0", gym_examples.Ball, anew=anew, camera=camera)
-    task, frames, places, columns = made(line(id=name, variation=VariationConfig(light=0.5))), [], [], []
+    task, frames, places, columns, reds = made(line(id=name, variation=VariationConfig(light=0.2))), [], [], [], []
     for seed in (1, 2, 1):
         observation, _ = task.reset(seed=seed)
         frames.append(observation["pixels"])
         places.append(task.places()["body1"][0])
         assert places[-1] == pytest.approx(observation[keys.STATE][0])
-        columns.append(np.nonzero(task.segment() == 1)[1].mean())
+        ball = task.segment() == 1
+        columns.append(np.nonzero(ball)[1].mean())
+        reds.append(float(observation["pixels"][ball][:, 0].mean()) - observation["pixels"][ball][:, 2].mean())
     assert (columns[1] - columns[0]) / (places[1] - places[0]) > 10  # pixels a metre
     assert np.abs(frames[0].astype(int) - frames[1]).max() > 50
+    assert bool((reds[1] - reds[0]) / (places[1] - places[0]) > 100) == (anew == "model")
     np.testing.assert_array_equal(frames[0], frames[2])
     task.close()
 
