@@ -60,7 +60,7 @@ def test_a_registered_robot_is_a_task(name: str, width: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "width"), ROBOTS.items())
 def test_its_episodes_do_not_depend_on_being_looked_at(name: str, width: int) -> None:
-    config = compose(["env=gym", f"env.id={name}", "env.image_size=32", "env.frame_skip=2"]).env
+    config = compose(["env=gym", f"env.id={name}", "env.image_size=32", "env.frame_skip=2", "env.max_steps=50"]).env
     task, actions, ends = made(config), np.random.default_rng(0).uniform(-1, 1, (50, width)).astype(np.float32), []
     for draw in (True, False):
         task.draw_steps = draw
