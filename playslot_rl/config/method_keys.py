@@ -7,7 +7,7 @@ groups that methods share, and in what says which demonstrations they learn from
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -38,20 +38,20 @@ class Chosen:
         command: of `playslot`.
         config: its config.
         methods: as they are trained.
-        trained: their stages that the command trains.
-        found: those of a world model that is there.
+        stages: their own.
+        world: those of their world models; who has trained one before may type again what it was trained with.
     """
 
     command: str
     config: ExperimentConfig
     methods: tuple[Method, ...]
-    trained: tuple[StageSpec, ...]
-    found: tuple[StageSpec, ...] = ()
+    stages: tuple[StageSpec, ...]
+    world: tuple[StageSpec, ...] = ()
 
     def reads(self, key: str) -> bool:
         """Whether one of the methods reads a key, by its dotted name; true of keys that are not the methods' affair."""
         if key in DEMOS:
-            return any(stage.data in ("demos", "labelled") for stage in self.trained)
+            return any(stage.data in ("demos", "labelled") for stage in self.stages)
         if key == LABELS:
             return any(method.decodes or method.labelled_only for method in self.methods)
         if key == LABELLED and self.command == "compare" and self.config.compare.labels:
@@ -60,15 +60,13 @@ class Chosen:
             return True
         beside = f"{key.rpartition('.')[0]}.steps"  # whoever trains for so many steps looks as often as is said there
         named = beside if key in keys_of(ExperimentConfig, "free") else key
-        return any(_within(one, self._declared) and not _within(one, self._given) for one in (key, named))
+        return any(_within(one, stage.reads) for one in (key, named) for stage in (*self.stages, *self.world))
 
     def instead(self, key: str) -> str:
         """What to type, as the end of a message."""
         if key == LABELLED and self.reads("demos"):
             labels = self.command == "compare" and self.reads(LABELS)
             return f"expected {'labels' if labels else 'demos'}=, how many demonstrations with actions are learned from"
-        if _within(key, self._given):
-            return "expected none: it is of the world model that run= names"
         own = key.removeprefix(BASELINES).split(".")
         for first in range(1, len(own)):
             alike = [one for one in self._keys if one.endswith("." + ".".join(own[first:]))]
@@ -89,18 +87,10 @@ class Chosen:
         return tuple(f"{BASELINES}{method.name}" for method in self.methods if method.config is not None)
 
     @cached_property
-    def _declared(self) -> tuple[str, ...]:
-        return tuple(key for stage in self.trained for key in stage.reads)
-
-    @cached_property
-    def _given(self) -> tuple[str, ...]:
-        return tuple(key for stage in self.found for key in (*stage.keys, *stage.settings))
-
-    @cached_property
     def _keys(self) -> tuple[str, ...]:
-        """The keys of the methods' groups that are read."""
-        known = flatten(to_dict(self.config))
-        return tuple(key for key in known if key.partition(".")[0] in GROUPS and self.reads(key))
+        """The keys of the methods' groups that they read themselves."""
+        own, known = replace(self, world=()), flatten(to_dict(self.config))
+        return tuple(key for key in known if key.partition(".")[0] in GROUPS and own.reads(key))
 
 
 def _within(key: str, names: Iterable[str]) -> bool:
@@ -112,21 +102,18 @@ def chosen(config: ExperimentConfig, command: str) -> Chosen | None:
     """The methods that a command trains; None for commands that have no choice."""
     if command == "train-baseline":
         method = METHODS[config.method]
-        found = tuple(stage_named(name) for name in WORLD if name in method.last.parents)
-        return Chosen(command, config, (method,), _stages(method), found)
+        world = tuple(name for name in WORLD if name in method.last.parents)
+        return Chosen(command, config, (method,), _stages(method), tuple(map(stage_named, world)))
     if command == "compare":
-        methods = tuple(METHODS[name] for name in config.compare.methods)
-        trained = tuple(stage for method in methods for stage in _stages(method))
-        runs = [part for part in (config.run, *config.compare.runs.split(",")) if part.strip()]
-        world, made = [*WORLD], len(runs) < config.compare.worlds
+        methods, world = tuple(METHODS[name] for name in config.compare.methods), WORLD
+        stages = tuple(stage for method in methods for stage in _stages(method))
     elif command == "compare-video":
-        methods = tuple(map(method_of, config.compare_video.methods))
-        trained = tuple(stage_named("dynamics") if method.imagines else method.last for method in methods)
-        world, made = ["slots"], not config.run
+        methods, world = tuple(map(method_of, config.compare_video.methods)), WORLD[:1]
+        stages = tuple(stage_named("dynamics") if method.imagines else method.last for method in methods)
     else:
         return None
     parents = tuple(map(stage_named, world)) if any(method.slots for method in methods) else ()
-    return Chosen(command, config, methods, (*trained, *parents) if made else trained, () if made else parents)
+    return Chosen(command, config, methods, stages, parents)
 
 
 def _stages(method: Method) -> tuple[StageSpec, ...]:

@@ -16,11 +16,10 @@ from playslot_rl.errors import ConfigError
 LAPO_STEPS = "baselines.lapo.model.steps= or baselines.lapo.policy.steps="
 LABELS = "behaviour.labelled_demos"
 NONE = "none: leave it out"
-GIVEN = "none: it is of the world model that run= names"
 
 TABLE = {  # of each method: a key that it reads, others that it does not, and what is said instead
-    "playslot": ("behaviour.labelled_demos", {"slots.steps": GIVEN, "baselines.act.optim.lr": "behaviour.optim.lr"}),
-    "slot_oracle": ("behaviour.trim", {LABELS: "demos", "model.savi.slot_dim": GIVEN}),
+    "playslot": ("behaviour.labelled_demos", {"baselines.act.optim.lr": "behaviour.optim.lr"}),
+    "slot_oracle": ("behaviour.trim", {LABELS: "demos", "dynamics.steps": "behaviour.steps"}),
     "slot_bc": ("behaviour.log_every", {LABELS: "demos", "baselines.act.steps": "behaviour.steps"}),
     "resnet_oracle": ("behaviour.loss", {LABELS: "demos", "behaviour.trim": NONE}),
     "resnet_bc": ("baselines.resnet_oracle.shift", {LABELS: "demos", "behaviour.shift": "baselines.resnet_oracle.s"}),
@@ -41,7 +40,7 @@ TABLE = {  # of each method: a key that it reads, others that it does not, and w
     "caddy_oracle": ("baselines.caddy.actions", {LABELS: "demos", "behaviour.decoder_state": NONE}),
     "svg": ("baselines.svg.hidden", {"demos": NONE, "dynamics.seed_frames": "baselines.svg.seed_frames"}),
     "caddy": ("baselines.caddy.steps", {LABELS: NONE, "baselines.caddy_policy.decoder_steps": NONE}),
-    "slotformer": ("baselines.slotformer.predictor.dim", {"model.savi.slot_dim": GIVEN}),
+    "slotformer": ("model.savi.slot_dim", {"model.predictor.layers": "baselines.slotformer.predictor.layers"}),
     "ocvp_seq": ("baselines.ocvp_seq.steps", {"model.predictor.layers": "baselines.ocvp_seq.predictor.layers"}),
 }  # fmt: skip
 VALUES = flatten(to_dict(compose())) | {"demos": 3, "data.draw": 3, "behaviour.policy_from": "runs/first"}
@@ -81,7 +80,7 @@ def test_no_other_command_has_a_choice() -> None:
     [
         "methods=slot_oracle,playslot demos=20 behaviour.labelled_demos=10",
         "methods=playslot slots.steps=3 dynamics.steps=3 model.savi.token_dim=8",
-        "methods=slot_bc labels=5 run=pretrained worlds=2 slots.steps=3",
+        "methods=slot_bc labels=5 run=pretrained slots.steps=3 model.savi.n_slots=3",
         "methods=resnet_bc,slot_oracle labels=5",
     ],
 )
@@ -101,7 +100,6 @@ def test_a_comparison_takes_what_one_of_its_methods_reads(text: str) -> None:
             "got 10 with methods=playslot,lapo, which do not read it, expected labels=",
         ),
         ("methods=slot_oracle behaviour.labelled_demos=10", "expected demos="),
-        ("methods=playslot run=pretrained slots.steps=3", f"expected {GIVEN}"),
         ("methods=resnet_oracle dynamics.steps=3", "expected baselines.resnet_oracle.steps="),
         ("methods=dreamer demos=5", "demos: got 5 with methods=dreamer, which does not read it"),
         ("methods=slot_oracle labels=5", "labels: got 5 with methods=slot_oracle, which does not read it"),
