@@ -224,9 +224,11 @@ def with_value(config: Any, key: str, value: object) -> Any:
 
 
 def with_others_changed(config: ExperimentConfig) -> tuple[ExperimentConfig, set[str]]:
-    """A config in which choices, flags and numbers that its method does not read are others, and which these are."""
-    methods, changed = chosen(config, "train-baseline"), set[str]()
-    assert methods is not None
+    """A config in which choices, flags and numbers that its method does not read are others, and which these are: its
+    world model's, which is there, among them."""
+    typed, changed = chosen(config, "train-baseline"), set[str]()
+    assert typed is not None
+    methods = replace(typed, world=())
     for key, value in flatten(to_dict(config)).items():
         if key.partition(".")[0] in GROUPS and not methods.reads(key) and (others := other_values(key, value)):
             with suppress(ValueError):  # it does not go with the others
