@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
-from playslot_rl.config.families import task_name
-from playslot_rl.config.metaworld import VERSION, member
+from playslot_rl.config.families import member, task_name
+from playslot_rl.config.metaworld import VERSION
 from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, Frame, PixelTask
 from playslot_rl.envs.rendering import Camera, FrameRenderer, import_mujoco
 
@@ -64,7 +64,7 @@ class MetaWorldEnv(PixelTask):
     @classmethod
     def metadata_of(cls, config: EnvConfig) -> dict[str, Any]:
         """Gymnasium's metadata with the sentence that says what is to be done."""
-        return {**cls.metadata, "task": member(task_name(config.name, config.task)).sentence}
+        return {**cls.metadata, "task": member(config.name, config.task).sentence}
 
     def __init__(
         self,

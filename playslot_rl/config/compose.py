@@ -110,14 +110,14 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
         if run and not is_pretrained(run) and command in VIEWS and pairs.get("env") == "video":
             pairs = {**_views(Path(run)), **pairs}
         if continues:
-            config = _from_run(Path(run), pairs, command == "play")
+            config, typed = _from_run(Path(run), pairs, command == "play"), _typed(pairs)
         else:
             values, typed = _presets(pairs.get("env", PLAIN_ENV), pairs.get("preset", PRESET)), _typed(pairs)
             config = from_dict(ExperimentConfig, _with_task(values, typed))
             if config.env.id and not {"env.action_dim", "env.max_steps"} <= pairs.keys():  # only the environment knows
                 config = from_dict(ExperimentConfig, _with_task(values, typed, plugins.call(FITTED, config.env)))
         require_machine(config, {key: value for key, value in pairs.items() if key not in GROUPS})
-        require_read(config, flatten(_typed(pairs)), command)
+        require_read(config, flatten(typed), command)
     except ConfigError:
         raise
     except ValueError as error:

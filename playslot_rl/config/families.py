@@ -68,7 +68,7 @@ def task_name(env: str, task: str) -> str:
 def member(env: str, task: str) -> Member:
     """A task of an environment that has several, or a set of them, by what `task_name` reads."""
     name = task_name(env, task)
-    return metaworld.member(name) if env == metaworld.NAME else FAMILIES[env].tasks[name]
+    return FAMILIES[env].tasks[name] if env == OGBENCH else metaworld.member(name)
 
 
 def preset_values(env: Mapping[str, Any], preset: str, rollout: int, brought: Collection[str]) -> dict[str, Any]:

@@ -163,26 +163,29 @@ def test_the_shipped_world_model_of_another_task_is_refused() -> None:
         check_success(compared("run=pretrained", "env=block_reach"))
 
 
-def test_the_world_model_of_several_tasks_is_one_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = SimpleNamespace(group=lambda *_: EnvConfig("metaworld", task="reach+push"))
+@pytest.mark.parametrize(
+    ("trained", "its", "another", "message"),
+    [
+        (
+            EnvConfig("metaworld", task="reach+push"), "env.task=push", "env.task=door-open",
+            r"got a world model of env=metaworld env\.task=reach\+push, expected .* env\.task=door-open",
+        ),
+        (
+            EnvConfig("gym", id="FetchReach-v4"), "env.id=FetchReach-v4", "env.id=FetchPush-v4",
+            r"model of env=gym env\.id=FetchReach-v4, expected .*=FetchPush-v4",
+        ),
+    ],
+)  # fmt: skip
+def test_a_world_model_is_of_its_tasks_alone(
+    trained: EnvConfig, its: str, another: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = SimpleNamespace(group=lambda *_: trained)
     monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(world_stages={"slots": checkpoint}))
     monkeypatch.setattr(measure, "require_config", lambda *_: None)
-    given = ["env=metaworld", "run=several", "methods=playslot", "data.demos=demos"]
-    check_success(compared(*given, "env.task=push"))
-    with pytest.raises(
-        CheckpointError, match=r"of env=metaworld env\.task=reach\+push, expected .* env\.task=door-open"
-    ):
-        check_success(compared(*given, "env.task=door-open"))
-
-
-def test_the_world_model_of_another_gymnasium_environment_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = SimpleNamespace(group=lambda *_: EnvConfig("gym", id="FetchReach-v4"))
-    monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(world_stages={"slots": checkpoint}))
-    monkeypatch.setattr(measure, "require_config", lambda *_: None)
-    given = ["env=gym", "run=reach", "methods=playslot", "data.demos=demos"]
-    check_success(compared(*given, "env.id=FetchReach-v4"))
-    with pytest.raises(CheckpointError, match=r"model of env=gym env\.id=FetchReach-v4, expected .*=FetchPush-v4"):
-        check_success(compared(*given, "env.id=FetchPush-v4"))
+    given = [f"env={trained.name}", "run=trained", "methods=playslot", "data.demos=demos"]
+    check_success(compared(*given, its))
+    with pytest.raises(CheckpointError, match=message):
+        check_success(compared(*given, another))
 
 
 def test_too_few_demonstrations_are_refused() -> None:
