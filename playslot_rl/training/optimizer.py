@@ -49,6 +49,15 @@ def build_adam(parameters: Mapping[str, nn.Parameter], config: OptimConfig, **se
     return torch.optim.Adam(list(parameters.values()), lr=lr, fused=True, capturable=on_gpu, **settings)
 
 
-def clip_gradients(parameters: Mapping[str, nn.Parameter], maximum: float) -> Tensor:
-    """Clip the gradient norm in place (0: leave it) and return the norm before clipping, a scalar tensor."""
-    return nn.utils.clip_grad_norm_(parameters.values(), maximum if maximum > 0 else math.inf)
+def clip_gradients(parameters: Mapping[str, nn.Parameter], maximum: float, *, separate: bool = False) -> Tensor:
+    """Clip the gradient norm in place (0: leave it) and return the norm before clipping, a scalar tensor.
+
+    Args:
+        separate: each module, by the first word of the names, is clipped by its own norm; that of all is returned.
+    """
+    together: dict[str, list[nn.Parameter]] = {}
+    for name, parameter in parameters.items():
+        together.setdefault(name.partition(".")[0] if separate else "", []).append(parameter)
+    limit = maximum if maximum > 0 else math.inf
+    norms = [nn.utils.clip_grad_norm_(group, limit) for group in together.values()]
+    return norms[0] if len(norms) == 1 else torch.linalg.vector_norm(torch.stack(norms))

@@ -70,3 +70,10 @@ class PhasedStage(Protocol):
         """Equal for steps that compute the same from their batch; None where every step differs and none can be
         captured.
         """
+
+
+@runtime_checkable
+class SeparateStage(Protocol):
+    """A `Stage` of several networks that share nothing: `separate` is True, and none changes what another learns."""
+
+    separate: bool

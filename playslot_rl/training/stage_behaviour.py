@@ -105,6 +105,9 @@ class CloneStage:
         DataError: an oracle, but no actions.
     """
 
+    separate = True
+    """The oracle's gradients, of real actions, are clipped apart: they would change the policy, which sees none."""
+
     def __init__(
         self,
         policy: LatentPolicy,

@@ -33,7 +33,7 @@ from playslot_rl.seeds.draws import StepGenerators, derived_seed, global_seed
 from playslot_rl.training.batches import GlobalBatches
 from playslot_rl.training.memory import does_not_fit, out_of_memory
 from playslot_rl.training.optimizer import clip_gradients
-from playslot_rl.training.stage import PhasedStage
+from playslot_rl.training.stage import PhasedStage, SeparateStage
 
 WARM: Final = 3
 """Steps of a phase that are taken as they are written: kernels are chosen and Adam's state is made in them."""
@@ -179,7 +179,8 @@ class Steps:
 
     def _stepped(self, losses: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Clip, look whether all is finite, and let Adam step where it is."""
-        norm = clip_gradients(self.batches.parameters, self.config.optim.grad_clip)
+        separate = isinstance(self.stage, SeparateStage) and self.stage.separate
+        norm = clip_gradients(self.batches.parameters, self.config.optim.grad_clip, separate=separate)
         found = torch.stack([self._number, losses["loss"].detach().float(), norm.detach().float()])
         bad = ~found.isfinite().all()
         self._trouble.copy_(torch.where(bad & (self._trouble[0] < 0), found, self._trouble))
