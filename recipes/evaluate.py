@@ -118,22 +118,15 @@ def once(config: ExperimentConfig) -> bool:
     """Evaluate under `config.protocol`, without a report, unless the same policy was measured so before; whether it was
     measured now.
     """
-    from playslot_rl.evaluation.actions import asked, error_text
-    from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_facts, task_facts
+    from playslot_rl.evaluation.actions import error_text
+    from playslot_rl.evaluation.before import measured_before
 
-    run, protocol = Run.of(config), config.protocol
-    facts: dict[str, Any] = {"fingerprints": run_facts(run.folder, config.method).fingerprints}
-    if protocol == "actions":
-        facts["asked"] = asked(config)
-    else:
-        facts |= {"episodes": config.episodes or DEFAULT_EPISODES, "seed": config.seed}
-        facts |= task_facts(config, config.seed)
-    stored = run.result(f"evaluation/{protocol}/eval_info.json", facts)
+    stored = measured_before(config)
     if stored is None:
         main(config, report=False)
         return True
-    said = f"error {error_text(stored)}" if protocol == "actions" else rate(stored)
-    print(f"{protocol}: measured before, {said}, skipped", flush=True)
+    said = f"error {error_text(stored)}" if config.protocol == "actions" else rate(stored)
+    print(f"{config.protocol}: measured before, {said}, skipped", flush=True)
     return False
 
 

@@ -11,7 +11,6 @@ to RUN. A child names its parents by the fingerprints of their weights and refus
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,7 +23,7 @@ from playslot_rl.config.compose import PRETRAINED, near_run, stored_config
 from playslot_rl.config.plain import nearest
 from playslot_rl.data.contents import with_full_cameras
 from playslot_rl.errors import CheckpointError
-from playslot_rl.storage.atomic import read_json, write_bytes, write_json
+from playslot_rl.storage.atomic import json_or_nothing, read_json, write_bytes, write_json
 from playslot_rl.storage.folders import new_folder
 
 if TYPE_CHECKING:
@@ -110,8 +109,7 @@ class Run:
 
     def result(self, name: Path | str, facts: Mapping[str, Any]) -> dict[str, Any] | None:
         """What an evaluation wrote into this file before, if `facts` (parts of its result) are the same."""
-        path = self.folder / name
-        stored: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
+        stored = json_or_nothing(self.folder / name)
         return stored if stored and {key: stored.get(key) for key in facts} == facts else None
 
     # Stages

@@ -176,6 +176,10 @@ class Measure[J: Job](Protocol):
     def run(record: Record, evaluate: Evaluate) -> None:
         """Do what a job's file says, in a process of its own; what is done is skipped."""
 
+    @staticmethod
+    def agrees(record: Record) -> bool:
+        """Whether what lies in the folder of a job that ended is still its result; else it is due again."""
+
     def rows(self, job: J, status: launch.Status) -> list[dict[str, Any]]:
         """What came out of a job, finished or not; each row has its `name`, `status` and `error`."""
 
@@ -238,7 +242,9 @@ class Study[J: Job]:
         return due
 
     def _status(self, job: J) -> launch.Status:
-        return launch.read_status(job.file, self._jobs[job]["fingerprint"])
+        record = self._jobs[job]
+        status = launch.read_status(job.file, record["fingerprint"])
+        return status if status.status != "done" or self._measure.agrees(record) else launch.Status()
 
     def _ended(self, job: J) -> None:
         status = self._status(job)

@@ -159,6 +159,12 @@ def test_what_decides_an_evaluation_is_measured_again_when_it_changes(
     assert json.loads(info.read_text())["max_steps"] == 4
     again = (tmp_path / "out" / "runs" / first["name"] / "slot_oracle" / "checkpoint" / "weights.safetensors").stat()
     assert again.st_mtime_ns == weights.st_mtime_ns, "the training does not depend on it"
+    assert playslot("evaluate", f"run={info.parents[2]}", "seed=0", "episodes=1", *ONE_CORE).code == 0
+    assert json.loads(info.read_text())["episodes"] == 1
+    assert playslot(*command).code == 0
+    assert started == ["slot_oracle-d2-s0"] * 3, "what another command wrote there is none of the table"
+    assert _result(tmp_path / "out")["rows"][0]["outcomes"] == first["outcomes"]
+    assert again == info.parents[2].joinpath("slot_oracle", "checkpoint", "weights.safetensors").stat()
 
 
 def test_a_method_that_acts_is_trained_and_evaluated(tmp_path: Path, started: list[str]) -> None:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from jobs_on_disk import comparison, finish
 
+from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import wilson
+from playslot_rl.evaluation.success import task_facts
+from playslot_rl.recipes import compare_job
 from playslot_rl.runs import Run
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.launch import Status, read_status, write_status
 from playslot_rl.studies.study import count_parameters
 from playslot_rl.studies.success.figure import success_figure
-from playslot_rl.studies.success.jobs import SuccessJob
-from playslot_rl.studies.success.measure import job_rows
+from playslot_rl.studies.success.jobs import SuccessJob, success_config, success_record
+from playslot_rl.studies.success.measure import SuccessMeasure, job_rows
 from playslot_rl.studies.success.page import cell, success_page
 from playslot_rl.studies.success.summary import summarise
 from playslot_rl.visualization.charts import LIGHT, figure_bytes
@@ -51,6 +56,28 @@ def test_what_an_older_run_of_a_failed_job_left_is_not_counted(tmp_path: Path) -
     job = finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 9})
     write_status(job.file, Status("failed", "f", "out of memory", 1.0))
     assert job_rows(job, 5, read_status(job.file))[0]["success_rate"] is None
+
+
+@pytest.mark.parametrize("fault", [None, "seed", "episodes", "env", "render", "fingerprints", "first_seed", "", "run"])
+def test_a_job_is_done_only_while_its_own_result_lies_there(
+    fault: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = compose(["preset=smoke", "methods=lapo", "episodes=10", f"out={tmp_path}"], "compare")
+    job = finish(SuccessJob("lapo", 10, 0, tmp_path), {"simulation": 9}, fingerprint="w")
+    record = success_record(job, own := success_config(config, job, "pretrained"), {})
+    path = job.run / "evaluation" / "simulation" / "eval_info.json"
+    info = json.loads(path.read_text()) | {"seed": 100, "fingerprints": {"lapo": "w"}, **task_facts(own, 100)}
+    write_json(path, info if fault is None else {**info, fault: "other"} if fault else {})
+    if fault == "run":
+        shutil.rmtree(job.run)
+    assert SuccessMeasure.agrees(record) is (fault is None)
+
+    write_json(job.file, record)
+    write_status(job.file, Status("done", record["fingerprint"]))
+    again = list[str]()
+    monkeypatch.setattr(SuccessMeasure, "run", staticmethod(lambda record, _: again.append(record["name"])))
+    assert compare_job.main(job.file).status == "done"
+    assert again == ([] if fault is None else [job.name])
 
 
 def test_parameters_count_floats_of_run_and_parents(tmp_path: Path) -> None:

@@ -72,6 +72,10 @@ class Dice:
     def run(record: Record, evaluate: Evaluate) -> None:
         raise NotImplementedError
 
+    @staticmethod
+    def agrees(record: Record) -> bool:
+        return bool(record["fingerprint"])
+
     def rows(self, job: Throw, status: Status) -> list[dict[str, Any]]:
         eyes = job.seed + 1 if status.status == "done" else None
         return [{"name": job.name, "status": status.status, "error": status.error or None, "eyes": eyes}]
@@ -159,6 +163,18 @@ def test_a_job_that_is_asked_for_otherwise_is_run_again_and_waits_until_then(
     with pytest.raises(PlaySlotError):
         run_study(dice(fingerprint="g"))
     assert len(started) == 4
+
+
+def test_a_job_whose_result_was_written_over_is_run_again(
+    dice: Callable[..., Dice], started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(PlaySlotError):
+        run_study(dice())
+    started.clear()
+    monkeypatch.setattr(Dice, "agrees", staticmethod(lambda record: record["name"] != "red-s0"))
+    with pytest.raises(PlaySlotError, match=r"2 of 4 throws failed \(red-s0, blue-s1\)"):
+        run_study(dice())
+    assert started == ["red-s0", "blue-s1"]
 
 
 def test_a_launcher_gets_wave_after_wave(dice: Callable[..., Dice], started: Started) -> None:

@@ -13,6 +13,7 @@ from playslot_rl.config.methods import METHODS, require_told
 from playslot_rl.envs import RECORDED, check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.evaluation.actions import error_text, require_offline
+from playslot_rl.evaluation.before import measured_before
 from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.training import check_method
@@ -155,9 +156,16 @@ class SuccessMeasure:
     def run(record: Record, evaluate: Evaluate) -> None:
         config = from_dict(ExperimentConfig, record["config"])
         train("train-baseline", config, int(record["processes"]))
-        own = replace(config, run=config.out, out="", seed=int(record["evaluation_seed"]))
-        for protocol in record["protocols"]:
-            evaluate(replace(own, protocol=protocol))
+        for measured in _evaluations(record, config):
+            evaluate(measured)
+
+    @staticmethod
+    def agrees(record: Record) -> bool:
+        try:
+            config = from_dict(ExperimentConfig, record["config"])
+            return all(measured_before(measured) is not None for measured in _evaluations(record, config))
+        except CheckpointError:  # of a policy that is gone
+            return False
 
     def rows(self, job: SuccessJob, status: Status) -> list[dict[str, Any]]:
         return job_rows(job, self.config.acting.frame_skip, status)
@@ -203,6 +211,12 @@ class SuccessMeasure:
 
     def sheets(self) -> Mapping[str, bytes]:
         return {}
+
+
+def _evaluations(record: Record, config: ExperimentConfig) -> list[ExperimentConfig]:
+    """What a job evaluates once it is trained, a config for each protocol."""
+    own = replace(config, run=config.out, out="", seed=int(record["evaluation_seed"]))
+    return [replace(own, protocol=protocol) for protocol in record["protocols"]]
 
 
 def check_success(config: ExperimentConfig) -> None:

@@ -164,8 +164,12 @@ class VideoMeasure:
 
     @staticmethod
     def run(record: Record, evaluate: Evaluate) -> None:  # noqa: ARG004
-        job = VideoJob(record["method"], int(record["seed"]), Path(record["out"]), record["variant"])
-        VideoTraining(job, record).run(from_dict(ExperimentConfig, record["config"]))
+        VideoTraining(_job(record), record).run(from_dict(ExperimentConfig, record["config"]))
+
+    @staticmethod
+    def agrees(record: Record) -> bool:
+        job = _job(record)
+        return json_or_nothing(job.scores).get("fingerprint") == record["fingerprint"]
 
     def rows(self, job: VideoJob, status: Status) -> list[dict[str, Any]]:
         return [training_row(job, status)]
@@ -203,6 +207,10 @@ class VideoMeasure:
     def sheets(self) -> Mapping[str, bytes]:
         names = {key: sheet_name(*key) for key in self._truth}
         return {name: png(video_sheet(self._truth[key], _predictions(self._jobs, name))) for key, name in names.items()}
+
+
+def _job(record: Record) -> VideoJob:
+    return VideoJob(record["method"], int(record["seed"]), Path(record["out"]), record["variant"])
 
 
 def _predictions(jobs: Mapping[VideoJob, Record], name: str) -> dict[str, npt.NDArray[np.uint8]]:
