@@ -17,6 +17,7 @@ that of the outcomes, cell by cell, so that pairs share world model, seed and ep
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from statistics import NormalDist
@@ -57,8 +58,40 @@ def wilson(successes: float, trials: int) -> Interval:
     return low, high
 
 
-def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf)) -> Interval:
-    """95 % interval of the mean outcome, cut to `bounds`; a ValueError where nothing was measured.
+def newcombe(both: float, first: float, second: float, pairs: int) -> Interval:
+    """95 % interval of the difference of two success probabilities on the same episodes: Wilson's intervals of the two,
+    squared and added with their correlation (R. Newcombe, 1998, paired data, method 10). `both` succeeded in so many of
+    the pairs, the `first` or the `second` alone in others; they may be means over repetitions.
+
+    Example:
+        >>> [round(end, 3) for end in newcombe(46, 4, 0, 50)]
+        [-0.006, 0.188]
+    """
+    won, lost = both + first, both + second
+    odds = both * (pairs - both - first - second) - first * second
+    spread = math.sqrt(max(0.0, won * (pairs - won) * lost * (pairs - lost)))
+    alike = (max(odds - pairs / 2, 0.0) if odds > 0 else odds) / spread if spread else 0.0
+    (low, high), (other_low, other_high) = wilson(min(won, pairs), pairs), wilson(min(lost, pairs), pairs)
+    rate, other = won / pairs, lost / pairs
+
+    def end(mine: float, theirs: float) -> float:
+        return math.sqrt(max(0.0, mine * mine - 2 * alike * mine * theirs + theirs * theirs))
+
+    return rate - other - end(rate - low, other_high - other), rate - other + end(high - rate, other - other_low)
+
+
+def weighted_mean(outcomes: Outcomes, weights: npt.ArrayLike = 1.0) -> float:
+    """Mean of what was measured, with weights of shape (E,) or of the outcomes'."""
+    there = ~np.isnan(outcomes)
+    shares = np.where(there, weights, 0.0)
+    return float((np.where(there, outcomes, 0.0) * shares).sum() / shares.sum())
+
+
+def hierarchical(
+    outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf), weights: npt.ArrayLike = 1.0
+) -> Interval:
+    """95 % interval of the mean outcome, cut to `bounds`; with `weights` (E,), such as the actions of each episode, of
+    `weighted_mean`, a ratio whose two sums are drawn together. A ValueError where nothing was measured.
 
     Example:
         >>> hierarchical(np.ones((3, 5, 20)))
@@ -67,10 +100,10 @@ def hierarchical(outcomes: Outcomes, bounds: Interval = (-math.inf, math.inf)) -
     there = ~np.isnan(outcomes)
     if outcomes.ndim != 3 or not there.any():
         raise ValueError(f"outcomes: got shape {outcomes.shape} with {there.sum()} measured, expected (W, S, E)")
-    values, mean = np.where(there, outcomes, 0.0), float(np.nanmean(outcomes))
+    shares, value = np.where(there, weights, 0.0), weighted_mean(outcomes, weights)
     counts = [_counts(units, level) for level, units in enumerate(outcomes.shape)]
-    drawn, weight = _sums(counts, values), _sums(counts, there.astype(np.float64))
-    return _widened(mean, drawn[weight > 0] / weight[weight > 0], _widening(outcomes), bounds)
+    drawn, weight = _sums(counts, np.where(there, outcomes, 0.0) * shares), _sums(counts, shares)
+    return _widened(value, drawn[weight > 0] / weight[weight > 0], _widening([outcomes], weights), bounds)
 
 
 def resampled(statistic: Callable[[Outcomes], Outcomes], units: int, bounds: Interval) -> Interval:
@@ -95,6 +128,18 @@ def of_successes(outcomes: Outcomes) -> Interval:
     if there.any(axis=2).sum() == 1:
         return alone
     low, high = hierarchical(outcomes, RATE)
+    return min(low, alone[0]), max(high, alone[1])
+
+
+def of_differences(outcomes: Outcomes, reference: Outcomes) -> Interval:
+    """95 % interval of a difference of success rates on pairs: the bootstrap's, or Newcombe's of as many pairs as there
+    are episodes where that is wider, as where few of them differ.
+    """
+    apart = paired(outcomes, reference)
+    there = ~np.isnan(apart)
+    pairs, both = int(there.any(axis=(0, 1)).sum()), outcomes * reference
+    won = [float(np.nanmean(np.where(there, one, np.nan))) * pairs for one in (both, outcomes - both, reference - both)]
+    alone, (low, high) = newcombe(*won, pairs), hierarchical(apart, (-1.0, 1.0))
     return min(low, alone[0]), max(high, alone[1])
 
 
@@ -134,9 +179,9 @@ def _middle(scores: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]) -
 
 
 def over_tasks(tasks: Sequence[Outcomes], seed: int = 0) -> tuple[float, Interval]:
-    """Interquartile mean of the runs' rates over tasks, each (W, S, E) with all measured, and its 95 % interval: the
-    percentiles of draws within each task, at least Wilson's over the middle half of all episodes. Every task weighs the
-    same, and its runs share it.
+    """Interquartile mean of the runs' rates over tasks, each (W, S, E) with all measured, and its 95 % interval: that
+    of draws within each task, widened as `hierarchical`'s, at least Wilson's over the middle half of all episodes.
+    Every task weighs the same, and its runs share it.
     """
     drawn, weights = list[npt.NDArray[np.float64]](), list[npt.NDArray[np.float64]]()
     for number, outcomes in enumerate(tasks):
@@ -145,13 +190,14 @@ def over_tasks(tasks: Sequence[Outcomes], seed: int = 0) -> tuple[float, Interva
         share = worlds[:, :, None] * seeds[:, None, :]
         drawn.append(rates.reshape(DRAWS, -1))
         weights.append((share / share.sum(axis=(1, 2), keepdims=True)).reshape(DRAWS, -1))
-    low, high = np.quantile(_middle(np.concatenate(drawn, axis=1), np.concatenate(weights, axis=1)), _TAILS)
+    middle = _middle(np.concatenate(drawn, axis=1), np.concatenate(weights, axis=1))
     runs = [outcomes.mean(axis=2).ravel() for outcomes in tasks]
     shares = [np.full(len(task), 1 / len(task)) for task in runs]
     score = interquartile_mean(np.concatenate(runs), np.concatenate(shares))
     trials = max(1, sum(outcomes.shape[2] for outcomes in tasks) // 2)
     alone = wilson(min(score, 1.0) * trials, trials)
-    return score, (min(float(low), alone[0]), max(float(high), alone[1]))
+    low, high = _widened(score, middle, _widening(tasks), RATE)
+    return score, (min(low, alone[0]), max(high, alone[1]))
 
 
 @functools.lru_cache(maxsize=32)
@@ -169,12 +215,14 @@ def _sums(counts: Sequence[npt.NDArray[np.float64]], values: Outcomes) -> npt.ND
     return sums
 
 
-def _widening(outcomes: Outcomes) -> float:
-    """`_student` at the degrees of freedom that the levels together have."""
+def _widening(tasks: Sequence[Outcomes], weights: npt.ArrayLike = 1.0) -> float:
+    """`_student` at the degrees of freedom that the levels together have, of all tasks."""
     shares, spent = [], []
-    for level, size in enumerate(outcomes.shape):
-        of_units = np.moveaxis(outcomes, level, 0).reshape(size, -1)
-        means = np.nanmean(of_units[~np.isnan(of_units).all(axis=1)], axis=1)
+    for outcomes, level in itertools.product(tasks, range(3)):
+        others = tuple({0, 1, 2} - {level})
+        weight = np.where(np.isnan(outcomes), 0.0, weights)
+        sums, whole = np.nansum(outcomes * weight, axis=others), weight.sum(axis=others)
+        means = sums[whole > 0] / whole[whole > 0]
         if len(means) > 1:
             shares.append(float(means.var(ddof=1)) / len(means))
             spent.append(shares[-1] ** 2 / (len(means) - 1))

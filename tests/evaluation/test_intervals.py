@@ -10,9 +10,12 @@ from playslot_rl.evaluation.intervals import (
     Outcomes,
     hierarchical,
     interquartile_mean,
+    newcombe,
+    of_differences,
     of_successes,
     over_tasks,
     paired,
+    resampled,
     wilson,
 )
 
@@ -84,6 +87,42 @@ def test_the_difference_of_rows_that_share_everything_but_luck_holds_0_and_is_na
 def test_the_difference_of_identical_rows_is_exactly_0() -> None:
     outcomes = simulated(np.random.default_rng(0), (3, 5, 40), 0.1, 0.1, 0.1)
     assert hierarchical(paired(outcomes, outcomes)) == (0.0, 0.0)
+
+
+def test_the_interval_of_a_paired_difference_equals_published_values() -> None:
+    # Newcombe (1998), Statistics in Medicine 17, 2635, Table IV, method 10: a, b, c, d of 50 pairs.
+    assert newcombe(36, 12, 2, 50) == pytest.approx((0.0569, 0.3404), abs=5e-5)
+    assert newcombe(1, 2, 3, 10) == pytest.approx([-end for end in newcombe(1, 3, 2, 10)[::-1]])
+
+
+@pytest.mark.parametrize(("more", "clear"), [(0, False), (1, False), (4, False), (6, True)])
+def test_few_pairs_that_differ_are_no_difference(more: int, clear: bool) -> None:
+    """As McNemar's exact test has it: p is 0.125 for 4 against 0, 0.031 for 6."""
+    won = np.ones((1, 1, 50))
+    low, high = of_differences(won, won - (np.arange(50) < more))
+    assert (low > 0) is clear
+    assert low < more / 50 < high
+    assert of_differences(won - (np.arange(50) < more), won) == pytest.approx((-high, -low))
+
+
+def test_differences_over_seeds_are_never_of_no_width_and_hold_the_bootstraps() -> None:
+    same = of_differences(np.ones((1, 3, 50)), np.ones((1, 3, 50)))
+    assert same == newcombe(50, 0, 0, 50)
+    assert same[1] > 0.05
+    first, second = (simulated(np.random.default_rng(n), (2, 3, 20), 0.1, 0.1, 0.1) for n in range(2))
+    second[1, 2] = np.nan
+    low, high = of_differences(first, second)
+    bootstrap = hierarchical(first - second, (-1.0, 1.0))
+    assert low <= bootstrap[0] < bootstrap[1] <= high
+
+
+@pytest.mark.parametrize("errors", [np.full(8, 0.1), np.array([2.0, 1, 3, 1, 1, 2, 1, 1])])
+def test_a_weighted_mean_is_a_ratio_whose_sums_are_drawn_together(errors: Outcomes) -> None:
+    actions = np.array([20.0, 20, 20, 200, 200, 25, 22, 180])
+    ratio = resampled(lambda drawn: drawn @ (actions * errors) / (drawn @ actions), 8, (0.0, np.inf))
+    assert hierarchical(errors[None, None], (0.0, np.inf), actions) == pytest.approx(ratio)
+    twice = hierarchical(errors[None, None], (0.0, np.inf), 2 * actions)
+    assert twice == pytest.approx(ratio)
 
 
 def test_a_row_without_world_models_is_paired_with_each_of_the_others() -> None:
@@ -162,6 +201,13 @@ def test_over_tasks_all_won_leaves_what_wilson_leaves_over_half_of_the_episodes(
     mixed = simulated(np.random.default_rng(0), (3, 5, 20), 0.1, 0.1, 0.1)
     mean, (low, high) = over_tasks([mixed, mixed])
     assert low < mean < high
+
+
+def test_two_seeds_widen_the_interval_over_tasks_as_that_of_one_task() -> None:
+    apart = np.stack([np.arange(400) % 10 < tenths for tenths in (5, 6)])[None].astype(np.float64)
+    alone = of_successes(apart)
+    assert over_tasks([apart])[1] == pytest.approx(alone, abs=0.1)
+    assert alone[1] - alone[0] > 0.5
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from jobs_on_disk import comparison
 
 from playslot_rl.config.methods import METHODS
-from playslot_rl.evaluation.intervals import hierarchical
+from playslot_rl.evaluation.actions import Errors, scores
 from playslot_rl.studies.success.errors import summarise_errors
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.summary import differences
@@ -44,8 +44,15 @@ def test_a_difference_is_that_of_the_errors_of_all_actions() -> None:
     [found] = differences([*rows("playslot", CLONED), *rows("lapo", CLONED + 1)], "playslot")
     assert (found["method"], found["protocol"], found["labels"], found["seeds"]) == ("lapo", "actions", 2, [0, 1])
     assert found["difference"] == pytest.approx(1.0)
-    apart = (np.ones((1, 2, 4)) * ACTIONS * 4 / ACTIONS.sum()).reshape(1, 2, 4)
-    assert found["ci95"] == pytest.approx(hierarchical(apart))
+    assert found["ci95"] == pytest.approx((1.0, 1.0)), "however many actions an episode has, each is worse by 1"
+
+
+def test_an_interval_is_that_of_evaluate() -> None:
+    [found] = summarise_errors(rows("lapo", CLONED[:1]))
+    own = Errors(*((ACTIONS * CLONED[0] ** power)[:, None] for power in (1, 2)), ACTIONS)
+    of_evaluate = scores(own, own, np.ones(1))
+    assert found["mae"] == pytest.approx(of_evaluate["mae"])
+    assert found["ci95"] == pytest.approx(of_evaluate["ci95"]["mae"])
 
 
 def test_episodes_that_are_hard_for_both_do_not_widen_it() -> None:

@@ -31,7 +31,7 @@ def _summary(cell: tuple[Any, ...], runs: Sequence[Mapping[str, Any]]) -> dict[s
         "runs": len(runs),
         "episodes": runs[0]["episodes"],
         **_means(runs),
-        "ci95": list(hierarchical(outcomes_of(runs, seeds), (0.0, np.inf))),
+        "ci95": list(hierarchical(outcomes_of(runs, seeds), (0.0, np.inf), runs[0]["per_episode"]["rows"])),
         "references": {name: _means([run["references"][name] for run in runs]) for name in names},
         "train_seconds": sum(run["train_seconds"] for run in runs) / len(runs),
     }

@@ -1,7 +1,7 @@
 """Rows of finished jobs pooled over world models and policy seeds: rates, differences to a reference, over tasks.
 
-Without a simulator the outcome of an episode is its actions' error: episode e of E, with n_e of N actions and mean
-error m_e, counts as E n_e m_e / N, so that the mean is that of actions.
+Without a simulator the outcome of an episode is the mean error of its actions, and their number its weight, so that
+the mean is that of actions.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import (
     Outcomes,
     hierarchical,
+    of_differences,
     of_successes,
     over_tasks,
     paired,
+    weighted_mean,
 )
 
 Row = Mapping[str, Any]
@@ -48,10 +50,7 @@ def outcomes_of(runs: Sequence[Row], seeds: Sequence[int]) -> Outcomes:
 
 
 def _of_episodes(run: Row) -> Sequence[float]:
-    if "mae" not in run:
-        return [int(one) for one in run["outcomes"]]
-    weights = np.asarray(run["per_episode"]["rows"])
-    errors: list[float] = (weights * len(weights) / weights.sum() * np.asarray(run["per_episode"]["mae"])).tolist()
+    errors: Sequence[float] = run["per_episode"]["mae"] if "mae" in run else [int(one) for one in run["outcomes"]]
     return errors
 
 
@@ -109,15 +108,16 @@ def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
             if not sides[0]:
                 continue
             seeds = sorted({run["seed"] for run in sides[0]})
-            outcomes, of_errors = paired(*(outcomes_of(side, seeds) for side in sides)), "mae" in there[0]
-            low, high = hierarchical(outcomes, *([] if of_errors else [(-1.0, 1.0)]))
+            tables, of_errors = [outcomes_of(side, seeds) for side in sides], "mae" in there[0]
+            apart, actions = paired(*tables), there[0]["per_episode"]["rows"] if of_errors else 1.0
+            low, high = hierarchical(apart, weights=actions) if of_errors else of_differences(*tables)
             clear = low > 0 or high < 0
             found.append(
                 {
                     **dict(zip(CELL, (*cell[:2], *at), strict=True)),
                     "title": runs[0]["title"],
                     "seeds": seeds,
-                    "difference": float(np.nanmean(outcomes)),
+                    "difference": weighted_mean(apart, actions),
                     "ci95": [low, high],
                     "leaves_out_0": clear,
                     "better": (high < 0) == of_errors if clear else None,
