@@ -110,7 +110,7 @@ def settings_section(given: ReportInput) -> Section:
             parts |= {"policy": given.agent.policy, "action decoder": given.agent.action_decoder}
         sizes = {name: sum(p.numel() for p in module.parameters()) for name, module in parts.items()}
         measured.append(["parameters", ", ".join(f"{name} {size:,}" for name, size in sizes.items())])
-    for protocol, result in part.read_evaluations(given.run).items():
+    for protocol, result in given.evaluations.items():
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
         measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn"])
@@ -137,15 +137,13 @@ def notes(given: ReportInput) -> list[str]:
             f"Still stretches left out: {percent(meta['kept_rows'])} of the demonstrations' rows were learned from, "
             "those in which the slots move and a few after them (`behaviour.trim`); no action was looked at."
         )
-    results = part.read_evaluations(given.run)
     found.append(
         "No evaluation seed is in a data set whose seeds are on record. An episode that starts solved is replaced by "
         "another seed and counted. The references of both protocols run closed-loop."
-        if results
+        if given.evaluations
         else "Nothing has been evaluated yet."
     )
-    seeds = {r.get("seed") for r in results.values()}
-    if len(seeds) == 1:
+    if given.evaluations:
         found.append("One training seed: the intervals cover the choice of episodes, not that of the training run.")
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -71,11 +72,20 @@ class ReportInput:
     shown: str
     metas: dict[str, dict[str, Any]] = field(default_factory=dict)
 
+    @cached_property
+    def evaluations(self) -> dict[str, dict[str, Any]]:
+        """Protocol -> `eval_info.json`, for those that are there and of the weights that the run has now."""
+        found = {name: json_or_nothing(self.run / "evaluation" / name / "eval_info.json") for name in PROTOCOLS}
+        return {name: one for name, one in found.items() if one and self._measures(one)}
+
+    def _measures(self, result: dict[str, Any]) -> bool:
+        pairs = [(self.metas.get(s, {}).get("fingerprint"), of) for s, of in result.get("fingerprints", {}).items()]
+        return all(now in (None, of) for now, of in pairs)
+
     @property
     def first_seed(self) -> int:
         """First seed of the last evaluation, so that the pictures show episodes that were measured."""
-        results = read_evaluations(self.run)
-        seeds = [result["seeds"][0] for result in results.values()]
+        seeds = [result["seeds"][0] for result in self.evaluations.values()]
         return int(seeds[0]) if seeds else first_seed(self.config, self.config.seed)
 
     def command(self, name: str, rest: str = "") -> str:
@@ -102,12 +112,6 @@ def seconds(value: float | None) -> str:
     return "–" if value is None else format_seconds(value)
 
 
-def read_evaluations(run: Path) -> dict[str, dict[str, Any]]:
-    """Protocol -> `eval_info.json`, for those that are there."""
-    found = {protocol: json_or_nothing(run / "evaluation" / protocol / "eval_info.json") for protocol in PROTOCOLS}
-    return {protocol: result for protocol, result in found.items() if result}
-
-
 WAYS = {
     "simulation": "PlaySlot, in simulation",
     "imagination": "PlaySlot, in imagination",
@@ -117,7 +121,7 @@ REFERENCES = {"slot_oracle": "slot oracle", "expert": "scripted expert", "random
 
 
 def success_section(given: ReportInput) -> Section:
-    results = read_evaluations(given.run)
+    results = given.evaluations
     blocks: list[Block] = []
     if results:
         rows = _success_rows(results)
@@ -128,7 +132,8 @@ def success_section(given: ReportInput) -> Section:
             said = f"return {result['mean_return']:.2f}" if "mean_return" in result else percent(result["success_rate"])
             cells.append([name, said, interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
-        blocks.append(Table(headers, cells, "Wilson intervals. References run closed-loop on the same seeds."))
+        same = "the same seeds" if len(_by_seeds(results)) == 1 else "the seeds that are named"
+        blocks.append(Table(headers, cells, f"Wilson intervals. References run closed-loop on {same}."))
         blocks += _task_table(rows)
         drawn = [
             (n, r["success_rate"], tuple(r["ci95"]), method)
@@ -136,9 +141,10 @@ def success_section(given: ReportInput) -> Section:
             if r["success_rate"] is not None
         ]
         alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
+        steps = results.get("imagination", {}).get("max_steps", given.config.acting.max_steps)
         ways = (
             "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
-            f"{given.config.acting.max_steps} steps in latent space, and the decoded actions are then executed."
+            f"{steps} steps in latent space, and the decoded actions are then executed."
         )
         if "replay" in results:
             ways += (
@@ -150,7 +156,7 @@ def success_section(given: ReportInput) -> Section:
     for protocol in POLICY_PROTOCOLS:
         if protocol not in results:
             command = given.command("evaluate", f"protocol={protocol}")
-            blocks.append(Missing(f"Success in {protocol} has not been measured.", command))
+            blocks.append(Missing(f"Success in {protocol} has not been measured with these weights.", command))
     return Section("Success", blocks)
 
 
@@ -164,11 +170,21 @@ def _task_table(rows: Sequence[tuple[str, dict[str, Any], str, str]]) -> list[Bl
 
 def _success_rows(results: dict[str, dict[str, Any]]) -> list[tuple[str, dict[str, Any], str, str]]:
     rows = [(WAYS[p], results[p], "playslot", str(results[p]["episodes"])) for p in PROTOCOLS if p in results]
-    last = next(iter(results.values()))
-    for name, label in REFERENCES.items():
-        if name in last.get("references", {}):
-            rows.append((label, last["references"][name], name, str(last["episodes"])))
+    apart = _by_seeds(results)
+    for protocols in apart:
+        where = f", seeds of {' and '.join(protocols)}" if len(apart) > 1 else ""
+        one = results[protocols[0]]
+        there = {name: label for name, label in REFERENCES.items() if name in one.get("references", {})}
+        rows += [(label + where, one["references"][name], name, str(one["episodes"])) for name, label in there.items()]
     return rows
+
+
+def _by_seeds(results: dict[str, dict[str, Any]]) -> list[list[str]]:
+    """The protocols that were measured on the same seeds, together."""
+    found: dict[tuple[int, ...], list[str]] = {}
+    for protocol, result in results.items():
+        found.setdefault(tuple(result["seeds"]), []).append(protocol)
+    return list(found.values())
 
 
 def rollout_section(given: ReportInput) -> Section:

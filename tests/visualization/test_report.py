@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 import torch
 
+from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.testing import tiny_config
 from playslot_rl.visualization import latents
 from playslot_rl.visualization.charts import loss_names
 from playslot_rl.visualization.document import Document, Missing, Section, Table, Text, to_html, to_markdown
-from playslot_rl.visualization.report import write_report
+from playslot_rl.visualization.report import notes, read_metas, write_report
+from playslot_rl.visualization.sections import ReportInput, success_section
 from playslot_rl.world_model import Agent, WorldModel
 
 REFERENCES = {
@@ -129,6 +131,44 @@ def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: py
     assert len(re.findall(r'<img src="data:image/png;base64,[A-Za-z0-9+/=]{500,}" alt="[^"]', html)) == len(named)
     assert all((run / name).stat().st_size > 500 for name in named)
     assert str(tmp_path) not in html + text  # no path of this machine
+
+
+def _success(run: Path, config: ExperimentConfig) -> tuple[str, str]:
+    """The success section and the notes."""
+    metas = read_metas(run)
+    with TaskPool(config.acting, config.render) as pool:
+        given = ReportInput(run, config, None, None, pool, "run", metas)
+        return to_markdown(Document("", "", [success_section(given)])), "\n".join(notes(given))
+
+
+def _change(run: Path, protocol: str, **values: object) -> None:
+    path = run / "evaluation" / protocol / "eval_info.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **values}))
+
+
+def test_results_of_another_policy_are_missing(tmp_path: Path) -> None:
+    run = _run(tmp_path, config := tiny_config(max_steps=2))
+    for protocol, policy in (("simulation", "old"), ("imagination", "new")):
+        _change(run, protocol, fingerprints={"slots": "s", "policy": policy}, max_steps=40)
+    meta = run / "policy" / "checkpoint" / "meta.json"
+    meta.write_text(json.dumps({**json.loads(meta.read_text()), "fingerprint": "new"}))
+    text, _ = _success(run, config)
+    assert "98 %" not in text
+    assert "Success in simulation has not been measured with these weights." in text
+    assert "50 %" in text
+    assert "unfolds 40 steps" in text
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_references_are_of_the_seeds_that_they_ran_on(tmp_path: Path, other: bool) -> None:
+    run = _run(tmp_path, config := tiny_config(max_steps=2))
+    if other:
+        _change(run, "imagination", seeds=[1, 2], episodes=2, seed=1)
+    text, said = _success(run, config)
+    assert text.count("| scripted expert") == 1 + other
+    assert ("on the same seeds." in text) is not other
+    assert ("| random actions, seeds of imagination | 0 % | 0 to 7 % | – | 2 |" in text) is other
+    assert "One training seed: " in said, "whatever the evaluations' seeds"
 
 
 def test_report_of_an_empty_run_says_what_is_missing_and_how_to_make_it(tmp_path: Path) -> None:
