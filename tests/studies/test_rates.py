@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
+from playslot_rl.evaluation.intervals import hierarchical
 from playslot_rl.studies.launch import Status, write_status
+from playslot_rl.studies.video import shared
 from playslot_rl.studies.video.jobs import VideoJob, video_record
-from playslot_rl.studies.video.measure import _predictions
+from playslot_rl.studies.video.measure import _predictions, summarise_video
 from playslot_rl.studies.video.training import VideoTraining, beyond
 
 
@@ -98,3 +101,27 @@ def test_savis_time_names_no_job(tmp_path: Path) -> None:
     records = [video_record(job, config, {}, lpips=False, slots_seconds=seconds) for seconds in (0.0, 30.0)]
     assert records[0]["fingerprint"] == records[1]["fingerprint"]
     assert records[0] == {key: value for key, value in records[1].items() if key != "slots_seconds"}
+
+
+def test_clips_of_one_episode_are_one_to_an_interval() -> None:
+    draws = np.random.default_rng(0)
+    of_episodes = draws.normal(20, 1, 6)
+    episodes = np.repeat(np.arange(6), 4)
+    scores = np.repeat(of_episodes, 4)[:, None] + np.zeros((24, 3))
+    kind = {"row": "", "sees": "", "clips_of": "", "seed_frames": 2, "title": "still"}
+    given = {**kind, **{name: scores.tolist() for name in ("psnr", "ssim", "lpips")}}
+    [found] = summarise_video([], [given], {("", 2): episodes})
+    assert (found["clips"], found["episodes"]) == (24, 6)
+    assert found["psnr"] == pytest.approx(of_episodes.mean())
+    assert found["psnr_ci95"] == pytest.approx(hierarchical(of_episodes[None, None]))
+    [apart] = summarise_video([], [given], {("", 2): np.arange(24)})
+    wide, narrow = (row["psnr_ci95"][1] - row["psnr_ci95"][0] for row in (found, apart))
+    assert wide > 2 * narrow
+    [uneven] = summarise_video([], [given], {("", 2): np.minimum(episodes, 4)})
+    assert uneven["psnr"] == pytest.approx(of_episodes.mean()), "still the mean over clips"
+
+
+def test_a_clip_is_of_the_recorded_episode_that_its_frames_are_in() -> None:
+    source = SimpleNamespace(starts=np.array([8, 0, 4]), lengths=np.array([4, 4, 4]), numbers=np.array([5, 7, 7]))
+    tested = shared.Tested("", 1, source, np.array([[0, 1], [2, 3], [9, 10], [6, 7]]))  # type: ignore[arg-type]
+    assert tested.episodes.tolist() == [7, 7, 5, 7], "two views of one recording are one"

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.config.compare_video import method_of
+from playslot_rl.data.windows import IntArray
 from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.evaluation.intervals import hierarchical
@@ -37,7 +38,7 @@ from playslot_rl.studies.video.shared import (
     sheet_name,
     slots_seconds,
     test_sets,
-    true_frames,
+    tested_clips,
 )
 from playslot_rl.studies.video.training import VideoTraining, beyond, require_begun_alike
 from playslot_rl.visualization.document import to_markdown
@@ -80,12 +81,17 @@ def training_row(job: VideoJob, status: Status) -> dict[str, Any]:
     }
 
 
-def summarise_video(jobs: Sequence[Mapping[str, Any]], references: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One row a method, kind of row, test set and number of seed frames: means over training seeds and clips.
+def summarise_video(
+    jobs: Sequence[Mapping[str, Any]],
+    references: Sequence[Mapping[str, Any]],
+    episodes: Mapping[tuple[str, int], IntArray],
+) -> list[dict[str, Any]]:
+    """One row a method, kind of row, test set and number of seed frames: means over training seeds and clips, whose
+    episodes (C,) are given by test set and number of seed frames; clips of one are no more than one to an interval.
 
     Keys: `method` (null for references), `title`, `variant`, `row`, `sees`, `clips_of`, `seed_frames`, `seeds`,
-    `clips`, and for each of `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over training seeds and
-    clips), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
+    `clips`, `episodes`, and for each of `psnr`, `ssim` and `lpips` its mean, `NAME_ci95` (bootstrap over training seeds
+    and episodes), and `NAME_steps` with `NAME_steps_ci95` (P); null where it was not measured.
     """
     groups: dict[tuple[Any, ...], list[tuple[int | None, Mapping[str, Any]]]] = {}
     for job in jobs:
@@ -99,22 +105,25 @@ def summarise_video(jobs: Sequence[Mapping[str, Any]], references: Sequence[Mapp
     for key, group in groups.items():
         seeds = sorted(seed for seed, _ in group if seed is not None)
         summary = dict(zip(("method", "title", "variant", *KIND), key, strict=True))
-        summary |= {"seeds": seeds, "clips": len(group[0][1]["psnr"])}
+        of_clips = episodes[summary["clips_of"], summary["seed_frames"]]
+        summary |= {"seeds": seeds, "clips": len(of_clips), "episodes": len(np.unique(of_clips))}
         for name in METRICS:
-            summary |= _of_metric(name, [score[name] for _, score in group])
+            summary |= _of_metric(name, [score[name] for _, score in group], of_clips)
         rows.append(summary)
     return rows
 
 
-def _of_metric(name: str, values: Sequence[Any]) -> dict[str, Any]:
+def _of_metric(name: str, values: Sequence[Any], episodes: IntArray) -> dict[str, Any]:
     if any(value is None for value in values):
         return dict.fromkeys((name, f"{name}_ci95", f"{name}_steps", f"{name}_steps_ci95"))
     scores = np.asarray(values, np.float64)[None]  # (1, seeds, C, P)
+    numbers, clips = np.unique(episodes, return_counts=True)
+    of_each = np.stack([scores[:, :, episodes == number].mean(axis=2) for number in numbers], axis=2)
     return {
         name: float(scores.mean()),
-        f"{name}_ci95": list(hierarchical(scores.mean(axis=3))),
+        f"{name}_ci95": list(hierarchical(of_each.mean(axis=3), weights=clips)),
         f"{name}_steps": scores.mean(axis=(0, 1, 2)).tolist(),
-        f"{name}_steps_ci95": [list(hierarchical(step)) for step in np.moveaxis(scores, 3, 0)],
+        f"{name}_steps_ci95": [list(hierarchical(step, weights=clips)) for step in np.moveaxis(of_each, 3, 0)],
     }
 
 
@@ -134,6 +143,7 @@ class VideoMeasure:
         self.launcher: tuple[str, Sequence[str]] = (own.launcher, own.hydra)
         self._jobs, self._lpips_reason = dict[VideoJob, Record](), ""
         self._references, self._truth = list[dict[str, Any]](), dict[tuple[str, int], npt.NDArray[np.uint8]]()
+        self._episodes = dict[tuple[str, int], IntArray]()
 
     def check(self) -> None:
         config = self.config
@@ -158,7 +168,10 @@ class VideoMeasure:
             own = video_config(config, job, config.run)
             found[job] = video_record(job, own, parents, not self._lpips_reason, slots_seconds(config))
         require_begun_alike(found, config.compare_video)
-        self._references, self._truth = score_references(config, parents), true_frames(config)
+        self._references = score_references(config, parents)
+        for tested in tested_clips(config):
+            key = tested.label, tested.shown
+            self._truth[key], self._episodes[key] = tested.truth(config.compare_video.pictures), tested.episodes
         self._jobs = found
         return found
 
@@ -195,7 +208,7 @@ class VideoMeasure:
             "trained": {"seed_frames": own.trained_seed, "predicted_frames": own.trained_frames},
             "budget_minutes": own.budget_minutes,
             "lpips": self._lpips_reason or "available",
-            "summary": summarise_video(rows, self._references),
+            "summary": summarise_video(rows, self._references, self._episodes),
             "jobs": [{key: value for key, value in row.items() if key != "scores"} for row in rows],
             "test": own.test,
             "slots_seconds": slots_seconds(config),

@@ -45,12 +45,14 @@ def video_page(result: Result) -> Document:
         if result["slots_seconds"]
         else f"**{after}.** "
     )
+    episodes = ", ".join(map(str, sorted({row["episodes"] for row in result["summary"]})))
     lead += (
         f"Preset `{result['preset']}`, training seeds {', '.join(map(str, result['seeds']))}; clips of "
         f"{trained['seed_frames']} and {trained['predicted_frames']} frames in training, the same videos for every "
         f"method. Tested on {result['predicted_frames']} predicted frames of clips of episodes that no training and "
         "no validation saw. Means over frames, clips and seeds; in brackets the 95 % bootstrap interval over seeds "
-        "and clips. What a model is told of the true future is a column: latents are inferred from it, as in the paper."
+        f"and episodes ({episodes}). What a model is told of the true future is a column: latents are inferred from "
+        "it, as in the paper."
     )
     sections = []
     for label in result["tested_on"]:

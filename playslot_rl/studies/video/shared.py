@@ -67,6 +67,18 @@ class Tested(NamedTuple):
     def fingerprint(self) -> str:
         return hashlib.sha256(self.source.frames[self.rows].tobytes()).hexdigest()[:16]
 
+    @property
+    def episodes(self) -> IntArray:
+        """Number of the recorded episode of each clip (clips,)."""
+        begins, source = self.rows[:, :1], self.source
+        inside = (source.starts <= begins) & (begins < source.starts + source.lengths)
+        numbers: IntArray = source.numbers[inside.argmax(axis=1)]
+        return numbers
+
+    def truth(self, clips: int) -> npt.NDArray[np.uint8]:
+        """Frames of the first clips, uint8 (clips, P, H, W, 3)."""
+        return self.source.frames[self.rows[:clips, self.shown :]]
+
 
 def tested_clips(config: ExperimentConfig) -> Iterator[Tested]:
     """The clips of each test set after each number of seed frames; raises as `open_clips`."""
@@ -203,12 +215,3 @@ def score_references(config: ExperimentConfig, parents: dict[str, str]) -> list[
             rows.append({"title": title, "row": "", "sees": sees, "clips_of": label, "seed_frames": shown, **scores})
     write_json(path, {"fingerprint": print_, "clips": clips, "rows": rows})
     return rows
-
-
-def true_frames(config: ExperimentConfig) -> dict[tuple[str, int], npt.NDArray[np.uint8]]:
-    """Frames of the first clips by test set and number of seed frames, uint8 (clips, P, H, W, 3)."""
-    own = config.compare_video
-    return {
-        (label, shown): source.frames[rows[: own.pictures, shown:]]
-        for label, shown, source, rows in tested_clips(config)
-    }
