@@ -178,9 +178,9 @@ class PlannedActor(Actor):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The step's action; past the plan's end, its last one."""
-        step = tensordict.get(keys.STEP_COUNT)
+        step, plan = tensordict.get(keys.STEP_COUNT), tensordict.get(keys.PLANNED_ACTIONS)
         rows = torch.arange(len(step), device=step.device)
-        action = tensordict.get(keys.PLANNED_ACTIONS)[rows, step.squeeze(-1).clamp(max=self.steps - 1)]
+        action = plan[rows, step.squeeze(-1).clamp(max=plan.shape[1] - 1)]
         return tensordict.set(keys.ACTION, action).set(keys.STEP_COUNT, step + 1)
 
 

@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
 
+from playslot_rl import keys
 from playslot_rl.acting.actor import ExpertActor
 from playslot_rl.acting.agent import ReplayActor, perform
+from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.episodes import TaskPool, run_episodes
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.evaluation.success import evaluate
@@ -71,3 +74,13 @@ def test_the_policy_is_not_asked(config: ExperimentConfig) -> None:
     with TaskPool(config.env, config.render) as pool:
         memory = ReplayActor(agent, lambda seeds: perform(pool, seeds)).reset(SEEDS)
     assert memory["planned_actions"].shape == (2, 20, 4)
+
+
+def test_longer_episodes_than_the_model_was_trained_on_are_acted_to_their_end(config: ExperimentConfig) -> None:
+    agent = Agent.untrained(WorldModel(tiny_config(max_steps=4).model, replace(config.env, max_steps=4))).eval()
+    loop = ClosedLoop(ReplayActor(agent, lambda seeds: (torch.zeros(1, 8, 3, 64, 64), torch.zeros(1, 7, 4))))
+    loop.reset([0])
+    plan = torch.arange(7.0).view(1, 7, 1).expand(1, 7, 4)
+    loop._memory[keys.PLANNED_ACTIONS] = plan.clone()
+    acted = torch.stack([loop.step(TensorDict({}, [1]))[keys.ACTION] for _ in range(7)], 1)
+    assert torch.equal(acted, plan)
