@@ -46,6 +46,7 @@ def main(config: ExperimentConfig) -> None:
     from playslot_rl.evaluation.goals import GoalPool
     from playslot_rl.evaluation.success import run_facts
     from playslot_rl.storage.atomic import write_json, write_text
+    from playslot_rl.storage.checkpoints import source_commit
     from playslot_rl.visualization.document import to_markdown
     from playslot_rl.visualization.planning_page import planning_page
 
@@ -62,7 +63,8 @@ def main(config: ExperimentConfig) -> None:
     for goals, size in sizes.items():
         with GoalPool(config.acting, config.render) as pool:
             common = {"demos": facts.demos, "labelled_demos": facts.labelled_demos, **_facts(config, run.folder)}
-            common |= {"fingerprints": facts.fingerprints, "commit": facts.commit, "size": asdict(size)}
+            common |= {"fingerprints": facts.fingerprints, "commit": source_commit(), "trained_at": facts.trained_at}
+            common |= {"size": asdict(size)}
             parts[goals] = _measure(config, agent, pool, goals, folder / goals, common)
     report = {"run": config.run, "command": "playslot " + " ".join(sys.argv[1:]), "settings": to_dict(config.plan)}
     report |= {"goals": parts, **_facts(config, run.folder)}

@@ -41,7 +41,7 @@ from playslot_rl.evaluation.intervals import resampled
 from playslot_rl.evaluation.success import hardware, run_facts
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.storage.checkpoints import StageCheckpoint
+from playslot_rl.storage.checkpoints import StageCheckpoint, source_commit
 
 PROTOCOL = "actions"
 AT_ONCE = 16
@@ -305,7 +305,8 @@ def evaluate_actions(run: Run, config: ExperimentConfig, device: torch.device) -
         "untold": list(recorded.untold),
         "wall_seconds": round(time.perf_counter() - began, 2),
         "fingerprints": facts.fingerprints,
-        "commit": facts.commit,
+        "commit": source_commit(),
+        "trained_at": facts.trained_at,
         "hardware": hardware(),
     }
     write_json(run.folder / "evaluation" / PROTOCOL / "eval_info.json", result)

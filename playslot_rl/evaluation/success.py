@@ -34,6 +34,7 @@ from playslot_rl.evaluation.intervals import wilson
 from playslot_rl.runtime.devices import processor
 from playslot_rl.runtime.threads import available_cores
 from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.checkpoints import source_commit
 from playslot_rl.world_model import Agent
 
 POLICY_PROTOCOLS: Final[tuple[Literal["simulation", "imagination"], ...]] = ("simulation", "imagination")
@@ -52,6 +53,7 @@ class RunFacts:
         demos, labelled_demos: demonstrations whose videos, and whose real actions, the policy was trained on; None if
             the run does not say.
         fingerprints: weights by stage.
+        trained_at: commit of the training.
         extra: what the method's checkpoint says of its own (`pretraining`, `env_steps`, which are
             agent steps).
     """
@@ -59,7 +61,7 @@ class RunFacts:
     demos: int | None = None
     labelled_demos: int | None = None
     fingerprints: dict[str, str] = field(default_factory=dict)
-    commit: str = ""
+    trained_at: str = ""
     method: str = "playslot"
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -84,7 +86,7 @@ def run_facts(run: Path, method: str = "playslot") -> RunFacts:
         demos=meta.get("demos"),
         labelled_demos=meta.get("labelled_demos"),
         fingerprints=prints,
-        commit=str(meta.get("commit", "")),
+        trained_at=str(meta.get("commit", "")),
         method=method,
         extra={name: meta[name] for name in ("pretraining", "env_steps") if name in meta},
     )
@@ -182,7 +184,8 @@ def measure(
         "wall_seconds": round(wall, 2),
         "wall_seconds_with_references": round(time.perf_counter() - begin, 2),
         "fingerprints": facts.fingerprints,
-        "commit": facts.commit,
+        "commit": source_commit(),
+        "trained_at": facts.trained_at,
         "hardware": hardware(),
     }
 

@@ -25,7 +25,7 @@ from playslot_rl.testing import tiny_config
 from playslot_rl.world_model import Agent, WorldModel, latent_policy_module
 
 SEED = 1_000_000_000
-FACTS = RunFacts(demos=7, labelled_demos=3, fingerprints={"slots": "a", "policy": "b"}, commit="c")
+FACTS = RunFacts(demos=7, labelled_demos=3, fingerprints={"slots": "a", "policy": "b"}, trained_at="c")
 
 
 def _agent(config: ExperimentConfig) -> Agent:
