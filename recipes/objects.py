@@ -33,10 +33,12 @@ def main(config: ExperimentConfig, run: Run) -> None:
 def main_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `main`, unless this world model was scored on these clips before."""
     from playslot_rl.evaluation.objects import DEFAULT_CLIPS, RESULT
+    from playslot_rl.evaluation.success import task_facts
 
     facts = {
         "episodes": config.episodes or DEFAULT_CLIPS,
         "seed": config.seed,
+        **task_facts(config, config.seed),
         "fingerprints": {name: stage.fingerprint for name, stage in run.world_stages.items()},
     }
     stored = run.result(RESULT, facts)
@@ -80,9 +82,11 @@ def score_slots(config: ExperimentConfig, run: Run) -> None:
 
 def score_slots_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `score_slots` with the default number of episodes, unless these slots were scored with this seed before."""
-    from playslot_rl.evaluation.objects import SLOTS_RESULT
+    from playslot_rl.evaluation.objects import DEFAULT_SCENES, SLOTS_RESULT
+    from playslot_rl.evaluation.success import task_facts
 
-    facts = {"seed": config.seed, "fingerprints": {"slots": run.stage("slots").fingerprint}}
+    facts = {"episodes": DEFAULT_SCENES, "seed": config.seed, **task_facts(config, config.seed)}
+    facts["fingerprints"] = {"slots": run.stage("slots").fingerprint}
     stored = run.result(SLOTS_RESULT, facts)
     if stored is not None:
         print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)

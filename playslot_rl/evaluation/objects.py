@@ -26,7 +26,7 @@ from playslot_rl.envs.grid_shapes import MOVES, Clips, generate
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.evaluation.probes import probe_moves
-from playslot_rl.evaluation.success import hardware
+from playslot_rl.evaluation.success import hardware, task_facts
 from playslot_rl.evaluation.video import video_metrics
 from playslot_rl.frames import psnr, to_float
 from playslot_rl.modules.savi import SAVi
@@ -178,6 +178,7 @@ def evaluate_run_objects(run: Run, model: WorldModel, config: ExperimentConfig) 
         "episodes": clips,
         "seed": config.seed,
         "seeds": seeds,
+        **task_facts(config, config.seed),
         **evaluate_objects(model, config, clips, seeds),
         "fingerprints": {name: stage.fingerprint for name, stage in run.world_stages.items()},
         "wall_seconds": round(time.perf_counter() - began, 2),
@@ -323,6 +324,7 @@ def evaluate_slots(run: Run, out: Path, config: ExperimentConfig, device: torch.
         "episodes": len(seeds),
         "seed": config.seed,
         "seeds": seeds,
+        **task_facts(config, config.seed),
         **score_slots(run.load_savi(device), segmented_episodes(config, seeds), seeds),
         "fingerprints": {"slots": run.stage("slots").fingerprint},
         "wall_seconds": round(time.perf_counter() - began, 2),
