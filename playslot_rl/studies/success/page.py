@@ -200,7 +200,8 @@ def cell(row: Result, result: Result) -> str:
     what = "policies" if several else "seeds"
     if row["runs"] > 1:
         text += f"; {what} {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
-    wanted = len(result["seeds"]) * len({job["world"] for job in result["rows"] if job["method"] == row["method"]})
+    own = [job for job in result["rows"] if all(job[key] == row[key] for key in ("method", "demos", "labels"))]
+    wanted = len({job["name"] for job in own})
     if row["runs"] < wanted:
         text += f"; {row['runs']} of {wanted} {what}"
     return f"{text})"
