@@ -38,53 +38,54 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
             f"protocol: got {config.protocol} with env={config.env.name}, which has no simulator, expected actions: "
             "the error on demonstrations that nothing was trained on"
         )
-    if not METHODS[config.method].imagines:
-        evaluate_baseline(config, run)
-        return
-    if config.env.name in PROCEDURAL:
+    own = METHODS[config.method].imagines
+    if own and config.env.name in PROCEDURAL:
         objects.main(config, run)
-        return
-    if config.protocol == "slots":
+    elif own and config.protocol == "slots":
         objects.score_slots(config, run)
-        return
-    from playslot_rl.acting.episodes import TaskPool
-    from playslot_rl.evaluation.success import evaluate_run, run_facts
+    else:
+        _success(config, run, report and own)
 
-    run_facts(run.folder)  # a run without a policy is refused before anything is loaded
-    require_task(config, run.own("policy").group(EnvConfig, "env"))
-    agent = run.load_agent(open_device(config.device, config.threads))
+
+def _success(config: ExperimentConfig, run: Run, report: bool) -> None:
+    """Measure a policy's success, a baseline's in simulation only, write `evaluation/PROTOCOL/eval_info.json`, and
+    print the result."""
+    from playslot_rl.acting.episodes import TaskPool
+    from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, evaluate_run
+
+    own = METHODS[config.method].imagines
+    if not own:
+        check_baseline_protocol(config)
+    _require_policy(config, run)
+    device = open_device(config.device, config.threads)
+    agent = run.load_agent(device) if own else None
     with TaskPool(config.acting, config.render) as pool:
-        result = evaluate_run(run.folder, agent, config, config.protocol, pool)
-        print(describe(result, run.folder))
+        if agent is not None:
+            result = evaluate_run(run.folder, agent, config, config.protocol, pool)
+        else:
+            actor = plugins.call(METHODS[config.method].load.actor, run, device).eval()
+            result = evaluate_actor(run.folder, actor, config, pool)
+        print(describe(result, run.folder), flush=True)
         if report:
             from playslot_rl.visualization.report import write_report
 
             print(f"report: {write_report(run.folder, agent=agent, pool=pool)}")
 
 
-def evaluate_baseline(config: ExperimentConfig, run: Run) -> None:
-    """Evaluate the baseline of `run` in simulation, write `evaluation/simulation/eval_info.json`, print the result."""
-    from playslot_rl.acting.episodes import TaskPool
-    from playslot_rl.evaluation.success import check_baseline_protocol, evaluate_actor, run_facts
+def _require_policy(config: ExperimentConfig, run: Run) -> None:
+    """Refuse a run without a policy, or of another task, before anything is loaded."""
+    from playslot_rl.evaluation.success import run_facts
 
-    check_baseline_protocol(config)
-    run_facts(run.folder, config.method)  # a run without a policy is refused before anything is loaded
+    run_facts(run.folder, config.method)
     require_task(config, run.own(method_stage(config.method)).group(EnvConfig, "env"))
-    device = open_device(config.device, config.threads)
-    actor = plugins.call(METHODS[config.method].load.actor, run, device)
-    actor.eval()
-    with TaskPool(config.acting, config.render) as pool:
-        print(describe(evaluate_actor(run.folder, actor, config, pool), run.folder), flush=True)
 
 
 def error_of_actions(config: ExperimentConfig, run: Run) -> None:
     """Hold the policy's actions against held-out demonstrations, and print the result."""
     from playslot_rl.evaluation.actions import evaluate_actions, require_offline
-    from playslot_rl.evaluation.success import run_facts
 
     require_offline(config.method)
-    run_facts(run.folder, config.method)  # a run without a policy is refused before anything is loaded
-    require_task(config, run.own(method_stage(config.method)).group(EnvConfig, "env"))
+    _require_policy(config, run)
     result = evaluate_actions(run, config, open_device(config.device, config.threads))
     print(describe_actions(result, run.folder), flush=True)
 

@@ -32,16 +32,11 @@ def main(config: ExperimentConfig, run: Run) -> None:
 
 def main_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `main`, unless this world model was scored on these clips before."""
+    from playslot_rl.evaluation.before import simulated_before
     from playslot_rl.evaluation.objects import DEFAULT_CLIPS, RESULT
-    from playslot_rl.evaluation.success import task_facts
 
-    facts = {
-        "episodes": config.episodes or DEFAULT_CLIPS,
-        "seed": config.seed,
-        **task_facts(config, config.seed),
-        "fingerprints": {name: stage.fingerprint for name, stage in run.world_stages.items()},
-    }
-    stored = run.result(RESULT, facts)
+    prints = {name: stage.fingerprint for name, stage in run.world_stages.items()}
+    stored = simulated_before(run, RESULT, config, prints, config.episodes or DEFAULT_CLIPS)
     if stored is not None and (run.folder / "report.html").is_file():
         print(f"objects: scored before, ARI {stored['ari']:.2f}, skipped", flush=True)
         return
@@ -82,12 +77,11 @@ def score_slots(config: ExperimentConfig, run: Run) -> None:
 
 def score_slots_if_needed(config: ExperimentConfig, run: Run) -> None:
     """As `score_slots` with the default number of episodes, unless these slots were scored with this seed before."""
+    from playslot_rl.evaluation.before import simulated_before
     from playslot_rl.evaluation.objects import DEFAULT_SCENES, SLOTS_RESULT
-    from playslot_rl.evaluation.success import task_facts
 
-    facts = {"episodes": DEFAULT_SCENES, "seed": config.seed, **task_facts(config, config.seed)}
-    facts["fingerprints"] = {"slots": run.stage("slots").fingerprint}
-    stored = run.result(SLOTS_RESULT, facts)
+    prints = {"slots": run.stage("slots").fingerprint}
+    stored = simulated_before(run, SLOTS_RESULT, config, prints, DEFAULT_SCENES)
     if stored is not None:
         print(f"slots: scored before, FG-ARI {stored['foreground_ari']:.2f}, skipped", flush=True)
         return

@@ -1,7 +1,8 @@
-"""Whether a policy was measured before just as it would be now."""
+"""Whether a policy, or slots, were measured before just as they would be now."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
@@ -15,10 +16,15 @@ def measured_before(config: ExperimentConfig) -> dict[str, Any] | None:
     episodes, seed, task and renderer; a CheckpointError where the run has no trained policy of `config.method`.
     """
     run = Run.of(config)
-    facts: dict[str, Any] = {"fingerprints": run_facts(run.folder, config.method).fingerprints}
+    prints, name = run_facts(run.folder, config.method).fingerprints, f"evaluation/{config.protocol}/eval_info.json"
     if config.protocol == PROTOCOL:
-        facts["asked"] = asked(config)
-    else:
-        facts |= {"episodes": config.episodes or DEFAULT_EPISODES, "seed": config.seed}
-        facts |= task_facts(config, config.seed)
-    return run.result(f"evaluation/{config.protocol}/eval_info.json", facts)
+        return run.result(name, {"asked": asked(config), "fingerprints": prints})
+    return simulated_before(run, name, config, prints, config.episodes or DEFAULT_EPISODES)
+
+
+def simulated_before(
+    run: Run, name: str, config: ExperimentConfig, prints: Mapping[str, str], episodes: int
+) -> dict[str, Any] | None:
+    """What a file of the run holds, if it is of so many episodes, the config's seed, task and renderer, and weights."""
+    facts = {"episodes": episodes, "seed": config.seed, **task_facts(config, config.seed)}
+    return run.result(name, facts | {"fingerprints": dict(prints)})
