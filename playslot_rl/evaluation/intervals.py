@@ -58,6 +58,17 @@ def wilson(successes: float, trials: int) -> Interval:
     return low, high
 
 
+def rate_text(rate: float, ci95: Sequence[float], note: str = "", unit: str = " %") -> str:
+    """A rate and its interval.
+
+    Example:
+        >>> rate_text(0.97, [0.93, 0.99], "; 2 of 3 seeds")
+        '97 % (93 to 99; 2 of 3 seeds)'
+    """
+    low, high = (100 * end for end in ci95)
+    return f"{100 * rate:.0f}{unit} ({low:.0f} to {high:.0f}{note})"
+
+
 def newcombe(both: float, first: float, second: float, pairs: int) -> Interval:
     """95 % interval of the difference of two success probabilities on the same episodes: Wilson's intervals of the two,
     squared and added with their correlation (R. Newcombe, 1998, paired data, method 10). `both` succeeded in so many of

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from playslot_rl.evaluation.goals import Frames
+from playslot_rl.evaluation.intervals import rate_text
 from playslot_rl.visualization.charts import Theme, figure_bytes, legend, panel_grid, style_axes
 from playslot_rl.visualization.document import Document, Section, Table, Text
 from playslot_rl.visualization.grid import image_grid
@@ -52,16 +53,12 @@ def _ways_table(results: Mapping[str, Mapping[str, Any]]) -> Table:
         cost = "" if row["plan_cost_first"] is None else f"{row['plan_cost_first']:.4f}"
         if row["proposal_cost_first"] is not None:
             cost += f", {row['proposal_cost_first']:.4f}"
-        rates = [_rate(row[f"{by}success_rate"], row[f"{by}ci95"]) for by in ("", "state_")]
+        rates = [rate_text(row[f"{by}success_rate"], row[f"{by}ci95"]) for by in ("", "state_")]
         away = f"{row['state_distance']:.3f} (start {row['state_distance_at_start']:.3f})"
         seconds = "" if row["seconds_per_decision"] is None else f"{row['seconds_per_decision']:.2f}"
         body.append([title(name), *rates, away, cost, seconds])
     headers = ["success", "by state", "off its place at the end, m", "planned cost, of the proposal", "s a decision"]
     return Table(["", *headers], body)
-
-
-def _rate(rate: float, interval: Sequence[float]) -> str:
-    return f"{100 * rate:.0f} % ({100 * interval[0]:.0f} to {100 * interval[1]:.0f})"
 
 
 def _solution(found: Mapping[str, Any]) -> list[Text | Table]:

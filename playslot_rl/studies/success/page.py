@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from playslot_rl.config.methods import METHODS, stage_named
 from playslot_rl.evaluation.actions import error_text
+from playslot_rl.evaluation.intervals import rate_text
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
 from playslot_rl.studies.success.errors import error_references
@@ -194,17 +195,14 @@ def cell(row: Result, result: Result) -> str:
     """Rate, interval and range: `97 % (93 to 99; seeds 96 to 98)`; and how many policies there are, if not all."""
     if "mae" in row:
         return error_text(row)
-    low, high = (100 * end for end in row["ci95"])
-    text = f"{100 * row['success_rate']:.0f} % ({low:.0f} to {high:.0f}"
-    several = len(row["worlds"]) > 1
-    what = "policies" if several else "seeds"
+    what, note = "policies" if len(row["worlds"]) > 1 else "seeds", ""
     if row["runs"] > 1:
-        text += f"; {what} {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
+        note = f"; {what} {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
     own = [job for job in result["rows"] if all(job[key] == row[key] for key in ("method", "demos", "labels"))]
     wanted = len({job["name"] for job in own})
     if row["runs"] < wanted:
-        text += f"; {row['runs']} of {wanted} {what}"
-    return f"{text})"
+        note += f"; {row['runs']} of {wanted} {what}"
+    return rate_text(row["success_rate"], row["ci95"], note)
 
 
 def _footnotes(result: Result) -> list[str]:
@@ -343,8 +341,7 @@ def _returns(result: Result) -> list[Section]:
 def _reference(value: Result) -> str:
     if value["success_rate"] is None:
         return f"return {value['mean_return']:.2f}" if "mean_return" in value else "not run"
-    low, high = value["ci95"]
-    return f"{100 * value['success_rate']:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+    return rate_text(value["success_rate"], value["ci95"])
 
 
 def _outcome(row: Result) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from playslot_rl.config.methods import METHODS
+from playslot_rl.evaluation.intervals import rate_text
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note
 from playslot_rl.studies.success.summary import CELL, across_tasks, largest
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
@@ -82,7 +83,8 @@ def _blocks(joint: Result, labels: int | None) -> list[Block]:
     there = {(cell["env"], cell["method"], cell["protocol"]): cell for cell in own}
     rows = {(row["method"], row["protocol"]): row for row in joint["rows"] if row["labels"] == labels}
     body = [[task, *(_cell(there.get((task, *method))) for method in methods)] for task in joint["tasks"]]
-    body.append([IQM, *(_rate(rows[method], "score") if method in rows else "–" for method in methods)])
+    means = [rate_text(row["score"], row["ci95"], unit="") if (row := rows.get(method)) else "–" for method in methods]
+    body.append([IQM, *means])
     titles = [METHODS[name].title + ("" if at == "simulation" else f", {at}") for name, at in methods]
     missing = any(cell["runs"] < cell["of"] for cell in own)
     caption = "In brackets 95 % intervals."
@@ -105,12 +107,7 @@ def _cell(cell: Result | None) -> str:
     note = f"{cell['runs']} of {cell['of']} {what}" if cell["runs"] < cell["of"] else ""
     if cell["success_rate"] is None:
         return f"– ({note})" if note else "–"
-    return _rate(cell, "success_rate", f"; {note}" if note else "")
-
-
-def _rate(row: Result, key: str, note: str = "") -> str:
-    low, high = row["ci95"]
-    return f"{100 * row[key]:.0f} ({100 * low:.0f} to {100 * high:.0f}{note})"
+    return rate_text(cell["success_rate"], cell["ci95"], f"; {note}" if note else "", unit="")
 
 
 def tasks_page(result: Result) -> Document:
