@@ -149,8 +149,9 @@ def of_differences(outcomes: Outcomes, reference: Outcomes) -> Interval:
     apart = paired(outcomes, reference)
     there = ~np.isnan(apart)
     pairs, both = int(there.any(axis=(0, 1)).sum()), outcomes * reference
-    won = [float(np.nanmean(np.where(there, one, np.nan))) * pairs for one in (both, outcomes - both, reference - both)]
-    alone, (low, high) = newcombe(*won, pairs), hierarchical(apart, (-1.0, 1.0))
+    parts = (np.where(there, part, np.nan) for part in (both, outcomes - both, reference - both))
+    won, first, second = (float(np.nanmean(part)) * pairs for part in parts)
+    alone, (low, high) = newcombe(won, first, second, pairs), hierarchical(apart, (-1.0, 1.0))
     return min(low, alone[0]), max(high, alone[1])
 
 
