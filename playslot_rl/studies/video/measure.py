@@ -182,7 +182,7 @@ class VideoMeasure:
     @staticmethod
     def agrees(record: Record) -> bool:
         job = _job(record)
-        return json_or_nothing(job.scores).get("fingerprint") == record["fingerprint"]
+        return bool(json_or_nothing(job.scores).get("fingerprint") == record["fingerprint"])
 
     def rows(self, job: VideoJob, status: Status) -> list[dict[str, Any]]:
         return [training_row(job, status)]

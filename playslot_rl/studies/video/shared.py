@@ -77,7 +77,8 @@ class Tested(NamedTuple):
 
     def truth(self, clips: int) -> npt.NDArray[np.uint8]:
         """Frames of the first clips, uint8 (clips, P, H, W, 3)."""
-        return self.source.frames[self.rows[:clips, self.shown :]]
+        frames: npt.NDArray[np.uint8] = self.source.frames[self.rows[:clips, self.shown :]]
+        return frames
 
 
 def tested_clips(config: ExperimentConfig) -> Iterator[Tested]:
