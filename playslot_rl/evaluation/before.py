@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from playslot_rl.config import ExperimentConfig
@@ -23,7 +24,7 @@ def measured_before(config: ExperimentConfig) -> dict[str, Any] | None:
 
 
 def simulated_before(
-    run: Run, name: str, config: ExperimentConfig, prints: Mapping[str, str], episodes: int
+    run: Run, name: Path | str, config: ExperimentConfig, prints: Mapping[str, str], episodes: int
 ) -> dict[str, Any] | None:
     """What a file of the run holds, if it is of so many episodes, the config's seed, task and renderer, and weights."""
     facts = {"episodes": episodes, "seed": config.seed, **task_facts(config, config.seed)}
