@@ -8,10 +8,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from playslot_rl.collectors.export import META_NAME, export
+from playslot_rl.collectors.export import export
 from playslot_rl.collectors.journal import SPEC_NAME, CollectionSpec, Journal, journal_path, read_spec, remove_leftover
 from playslot_rl.config import CollectorConfig, DataConfig, ExperimentConfig
-from playslot_rl.data.metadata import INFO_NAME, json_content
+from playslot_rl.data.metadata import INFO_NAME, RECORD_NAME, json_content
 from playslot_rl.envs import PROCEDURAL, play_config
 from playslot_rl.errors import ConfigError, DataError, OutputError
 from playslot_rl.runtime.progress import StageProgress
@@ -27,7 +27,7 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
     """
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return False
-    record = out / META_NAME
+    record = out / RECORD_NAME
     if not record.is_file():
         raise OutputError(f"{out}: got a folder or file of something else, expected none; choose another out=")
     differs = spec.difference(read_spec(record).get("spec"))
@@ -48,7 +48,7 @@ def is_complete(out: Path, spec: CollectionSpec) -> bool:
 
 def begun_episodes(out: Path) -> int | None:
     """Episodes of the collection that `out` holds, or that was begun there; None where there is none."""
-    for record in (out / META_NAME, journal_path(out.absolute()) / SPEC_NAME):
+    for record in (out / RECORD_NAME, journal_path(out.absolute()) / SPEC_NAME):
         if record.is_file():
             stored = read_spec(record)
             spec = stored if record.name == SPEC_NAME else stored.get("spec")

@@ -19,6 +19,7 @@ from playslot_rl import keys
 from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
 from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.config.env import in_turn
+from playslot_rl.data.metadata import RECORD_NAME
 from playslot_rl.envs import PROCEDURAL, task_metadata
 from playslot_rl.envs.grid_shapes import METADATA
 from playslot_rl.errors import OutputError
@@ -26,7 +27,6 @@ from playslot_rl.runtime.progress import quiet_datasets
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.storage.folders import new_folder
 
-META_NAME = "meta/playslot.json"
 PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
 VIDEO_ERROR = 2.0  # mean difference [0, 255] that h264 in yuv444p may make
 METADATA_ROWS = 200  # episodes in a row group of the episodes' metadata
@@ -192,7 +192,7 @@ def export(journal: Journal, out: Path) -> None:
                 "versions": {name: version(name) for name in PACKAGES},
                 "episodes": records,
             }
-            write_json(temporary / META_NAME, record)
+            write_json(temporary / RECORD_NAME, record)
     except Exception as error:
         # LeRobot swallows errors of writing images and fails later with others.
         if isinstance(error, OutputError) or shutil.disk_usage(out.parent).free >= FREE_BYTES:

@@ -101,9 +101,9 @@ def choose_prototypes(config: ExperimentConfig, run: Path, steps: int, milliseco
 
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
+    from playslot_rl.data.videos import open_videos
     from playslot_rl.evaluation.probes import infer_latents
     from playslot_rl.recipes import train_dynamics
-    from playslot_rl.training.record import open_videos
     from playslot_rl.world_model import module_device
 
     many, out = config.adopt.prototypes, run / "trials" / "prototypes"

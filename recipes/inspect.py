@@ -25,9 +25,9 @@ def main(config: ExperimentConfig) -> None:
 
     A pretrained model (`run=pretrained/ENV`) is made a run in `out` first, as `evaluate` does.
     """
+    from playslot_rl.data.videos import open_videos
     from playslot_rl.evaluation.card import DEFAULT_EPISODES, FOLDER, RESULT, card_json, make_card
     from playslot_rl.evaluation.card_lines import concluded
-    from playslot_rl.training.record import open_videos
     from playslot_rl.visualization.card_page import card_document
     from playslot_rl.visualization.document import write_document
 

@@ -131,12 +131,7 @@ def split_demonstrations(
         DataError: there are fewer episodes than `demos`, or none that is not kept.
     """
     count = source.recordings
-    free = count - kept
-    if free < 1:
-        raise DataError(
-            f"data.held_out: got {kept}, expected less than the {count} demonstrations there are: lower it "
-            "or collect more"
-        )
+    free = free_demonstrations(count, kept)
     trained = first_demonstrations(source, free if demos is None else demos)
     parsed = first_demonstrations(source, max(free, trained.recordings))
     last = max(kept, measured) if draw is None else count - drawn_among(count, kept, measured)
@@ -145,6 +140,16 @@ def split_demonstrations(
         trained = first_demonstrations(drawn_demonstrations(source, draw, count - last), trained.recordings)
     usable = bool((source.lengths[source.numbers >= rest] >= 2).any())
     return DemonstrationSplit(trained, parsed, episode_range(source, rest, count) if usable else None)
+
+
+def free_demonstrations(count: int, kept: int) -> int:
+    """How many demonstrations are not kept; a DataError where it is none."""
+    if count <= kept:
+        raise DataError(
+            f"data.held_out: got {kept}, expected less than the {count} demonstrations there are: lower it "
+            "or collect more"
+        )
+    return count - kept
 
 
 def drawn_among(episodes: int, kept: int, measured: int) -> int:

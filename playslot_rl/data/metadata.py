@@ -51,6 +51,23 @@ def json_content(path: Path) -> Any:
     return parsed(path.read_bytes())
 
 
+def read_record(root: Path) -> dict[str, Any] | None:
+    """Our own record of the data set at `root`, or None where there is none that can be used."""
+    path = root / RECORD_NAME
+    try:
+        record = json_content(path) if inside(root, path) else {}
+        json.dumps(record, allow_nan=False)
+        usable = all(isinstance(entry, dict) for entry in [*record["episodes"], *(record.get("sources") or [])])
+        spec = record.get("spec") or {}
+        numbers = (record.get("success_rate"), (spec.get("env") or {}).get("frame_skip"))
+        tables = (spec.get("render") or {}, record.get("versions") or {})
+        usable &= all(isinstance(table, dict) for table in tables)
+        usable &= all(number is None or isinstance(number, int | float) for number in numbers)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return record if usable else None
+
+
 def parsed(content: bytes) -> Any:
     """What JSON says, a byte-order mark before it passed over; a ValueError where it is none, or nested too deeply."""
     try:

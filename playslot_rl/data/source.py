@@ -35,6 +35,7 @@ from playslot_rl.data.cache import (
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.frame_build import FrameArray, build_frames
 from playslot_rl.data.metadata import stated_size
+from playslot_rl.data.prints import episode_origins, files_fingerprint
 from playslot_rl.data.remote import open_remote
 from playslot_rl.data.stream import FrameStream
 from playslot_rl.data.views import FrameRows, Frames, concatenate, views_of_one
@@ -61,7 +62,6 @@ class EpisodeFrames:
         starts, lengths: int64 (E,).
         actions: float32 (F, A), as they were recorded, NaN in those of several sets that have none; None if none has.
         unlabelled: names of those sets, with commas.
-        success: bool (F,), or None.
         seeds: int64 (E,), or None.
         fingerprint: content hash, 16 hex digits.
         robot: what was recorded, as the data set says; empty where it says nothing.
@@ -71,15 +71,15 @@ class EpisodeFrames:
         recorded: which recorded episode each is a view of, 0 to R - 1, int64 (E,); None where each is one of its own.
         limits: what actions in [-1, 1] stand for; None for those of our simulators, which are so, and without actions.
         states: proprioception, float32 (F, S), or None.
-        origins: of each episode a hash of its actions, or where they say nothing of its set and its number, str (E,):
-            the same in any set that it is copied to, and however it is viewed.
+        origins: of each episode a hash of its actions, or where they say nothing of its pictures, str (E,): the same in
+            any set that it is copied to, and however it is viewed (`playslot_rl.data.prints`); None where it is not
+            known.
     """
 
     frames: FrameRows
     starts: npt.NDArray[np.int64]
     lengths: npt.NDArray[np.int64]
     actions: npt.NDArray[np.float32] | None
-    success: npt.NDArray[np.bool_] | None
     seeds: npt.NDArray[np.int64] | None
     fingerprint: str
     fps: float
@@ -190,6 +190,7 @@ def open_sources(
         files = open_remote(str(root), cache_folder(cache)) if remote else open_files(root)
         labels = labels_of(files)
         limits = limits_of(files, labels["actions"])
+        origins = episode_origins(files, labels["actions"], cache_folder(cache))
         views: list[EpisodeFrames] = []
         for one in camera.split(","):
             frames, fingerprint, feature = _frames_of(files, one.strip(), cache, image_size, resize, buffer)
@@ -203,15 +204,12 @@ def open_sources(
                     robot=str(files.info.get("robot_type") or ""),
                     name=str(root),
                     limits=limits,
-                    origins=_origins(labels, fingerprint),
+                    origins=origins,
                     **labels,
                 )
             )
         sources.append(views_of_one(views))
     return concatenate(sources)
-
-
-open_source = open_sources
 
 
 def _frames_of(
@@ -272,48 +270,16 @@ def _frame_cache(files: Contents, camera: str, cache: CachePlace, size: int | No
     return build_once(folder / "frames" / key, build)
 
 
-def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
-    """Content hash of a data set, remembered by the names, sizes and times of its files: hashing videos is slow."""
-    if files.remote is not None:
-        return files.remote.fingerprint(camera)
-    listing = sorted(
-        (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
-        for folder in ("meta", "data", "videos")
-        for path in (files.root / folder).rglob("*")
-        if path.is_file()
-    )
-    key = hashlib.sha256(json.dumps([str(files.root.resolve()), camera, listing]).encode()).hexdigest()[:32]
-    note = cache / "fingerprints" / f"{key}.json"
-    if note.is_file():
-        return str(json.loads(note.read_text())["fingerprint"])
-    fingerprint = files.file_hash(camera)
-    write_json(note, {"fingerprint": fingerprint})
-    return fingerprint
-
-
-def _origins(labels: dict[str, Any], fingerprint: str) -> npt.NDArray[np.str_]:
-    def one(number: int, start: int, length: int) -> str:
-        known = np.zeros((1, 0)) if labels["actions"] is None else labels["actions"][start : start + length]
-        alike = bool((known == known[0]).all())  # which says nothing, as of unlabelled ones
-        return hashlib.sha256(f"{fingerprint}/{number}".encode() if alike else known.tobytes()).hexdigest()[:12]
-
-    spans = zip(labels["starts"], labels["lengths"], strict=True)
-    return np.array([one(number, *span) for number, span in enumerate(spans)], np.str_)
-
-
 def labels_of(files: Contents) -> dict[str, Any]:
-    """`starts`, `lengths`, `actions`, `states`, `success`, `seeds` and `tasks`, as of `EpisodeFrames`."""
+    """`starts`, `lengths`, `actions`, `states`, `seeds` and `tasks`, as of `EpisodeFrames`."""
     lengths = np.array([episode.length for episode in files.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
-    actions, states, success, seeds = map(
-        files.numbers, (keys.FEATURE_ACTION, keys.FEATURE_STATE, keys.FEATURE_SUCCESS, keys.FEATURE_SEED)
-    )
+    actions, states, seeds = map(files.numbers, (keys.FEATURE_ACTION, keys.FEATURE_STATE, keys.FEATURE_SEED))
     return {
         "starts": starts,
         "lengths": lengths,
         "actions": None if actions is None else actions.astype(np.float32).reshape(files.rows, -1),
         "states": None if states is None else states.astype(np.float32).reshape(files.rows, -1),
-        "success": None if success is None else success.astype(bool),
         "seeds": None if seeds is None else seeds[starts].astype(np.int64),
         "tasks": np.array([next(iter(episode.tasks), "") for episode in files.episodes], np.str_),
     }

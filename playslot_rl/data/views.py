@@ -167,9 +167,10 @@ def views_of_one(views: Sequence[EpisodeFrames]) -> EpisodeFrames:
 
 
 def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
-    """Refuse, by a DataError, sets of other frame sizes or rates, with `weights` of other robots or widths of actions,
-    too; what else is not as in the first is said."""
+    """Refuse, by a DataError, one set twice, sets of other frame sizes or rates, with `weights` of other robots or
+    widths of actions, too; what else is not as in the first is said."""
     first = sources[0]
+    known = {(first.fingerprint, first.camera)}
     for source in sources[1:]:
         size, expected = ("x".join(map(str, each.image_size)) for each in (source, first))
         facts: list[tuple[str, object, object, str]] = [
@@ -187,6 +188,12 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
                 raise DataError(f"{said}: read sets of one kind")
             if got != want:
                 say_once(f"note: {said}: {cure}")
+        if (source.fingerprint, source.camera) in known:
+            raise DataError(
+                f"{source.name}: got the frames of {source.camera} twice, expected each recording once: leave one out "
+                "of data.root= or data.camera="
+            )
+        known.add((source.fingerprint, source.camera))
         if source.name != first.name and source.camera != first.camera:
             seen = f"{source.name}: got frames of {source.camera}, expected {first.camera} as in {first.name}"
             say_once(f"note: {seen}: choose by data.camera=, unless they show the same view")
@@ -222,7 +229,6 @@ def concatenate(sources: Sequence[EpisodeFrames], weights: bool = False) -> Epis
         lengths=joined("lengths"),
         actions=actions,
         states=joined("states"),
-        success=joined("success"),
         seeds=joined("seeds"),
         tasks=joined("tasks"),
         origins=joined("origins"),
@@ -271,7 +277,6 @@ def every(source: EpisodeFrames, stride: int, action: Literal["mean", "last"] = 
         lengths=lengths.astype(np.int64),
         actions=None if source.actions is None else _led_actions(source, stride, action == "last"),
         states=None if source.states is None else source.states[rows],
-        success=None if source.success is None else source.success[rows],
         fps=source.fps / stride,
     )
 
@@ -296,7 +301,7 @@ def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames
     # A slice of a memory map is a view, but of others it would be copied to memory, all of it.
     sliced = slice(rows[0], rows[-1] + 1) if len(rows) == rows[-1] + 1 - rows[0] else rows
     frames = source.frames
-    whole = {name: getattr(source, name) for name in ("actions", "states", "success")}
+    whole = {name: getattr(source, name) for name in ("actions", "states")}
     labels: dict[str, Any] = {name: None if values is None else values[sliced] for name, values in whole.items()}
     return replace(
         chosen,
@@ -334,14 +339,20 @@ def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames,
     Raises:
         DataError: fewer than two would be left for either.
     """
-    kept = max(2, round(fraction * source.recordings))
-    if source.recordings - kept < 2:
+    trained, tested = tested_numbers(source.recordings, fraction)
+    return (
+        chosen_episodes(source, trained, f"trained {len(tested)}"),
+        chosen_episodes(source, tested, f"tested {len(tested)}"),
+    )
+
+
+def tested_numbers(episodes: int, fraction: float) -> tuple[IntArray, IntArray]:
+    """Numbers of these episodes, sorted; raises as `split_tested`."""
+    kept = max(2, round(fraction * episodes))
+    if episodes - kept < 2:
         raise DataError(
-            f"data.tested={fraction}: got {source.recordings} episodes, expected at least 4, two of them to train on: "
+            f"data.tested={fraction}: got {episodes} episodes, expected at least 4, two of them to train on: "
             "collect more"
         )
-    order = np.random.default_rng(TEST_STREAM).permutation(source.recordings)
-    return (
-        chosen_episodes(source, np.sort(order[kept:]), f"trained {kept}"),
-        chosen_episodes(source, np.sort(order[:kept]), f"tested {kept}"),
-    )
+    order = np.random.default_rng(TEST_STREAM).permutation(episodes)
+    return np.sort(order[kept:]), np.sort(order[:kept])

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.views import IntArray as IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.data.weighted import Shares, draw_episodes
 from playslot_rl.errors import DataError
 

@@ -13,7 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, SAViConfig
-from playslot_rl.data.windows import IntArray, split_episodes
+from playslot_rl.data.views import IntArray
+from playslot_rl.data.windows import split_episodes
 from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.card import DEFAULT_EPISODES

@@ -11,7 +11,6 @@ split; `split_dataset` also reads the whole metadata once an episode.
 from __future__ import annotations
 
 import copy
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +26,8 @@ from playslot_rl.data.metadata import (
     RECORD_NAME,
     STATS_NAME,
     VIDEO_PATH,
-    json_content,
+    read_record,
 )
-from playslot_rl.data.places import inside
 from playslot_rl.data.tables import TASKS_NAME, Array, Episode, Stats
 from playslot_rl.datasets.statistics import Aggregate, of_numbers, reduced
 from playslot_rl.datasets.video_copy import VideoCopier
@@ -251,20 +249,3 @@ def _write_record(choices: Sequence[Choice], out: Path, made_by: str) -> None:
     if outcomes and None not in outcomes:
         content["success_rate"] = sum(map(bool, outcomes)) / len(outcomes)
     write_json(out / RECORD_NAME, content)
-
-
-def read_record(root: Path) -> dict[str, Any] | None:
-    """Our own record of the data set at `root`, or None where there is none that can be used."""
-    path = root / RECORD_NAME
-    try:
-        record = json_content(path) if inside(root, path) else {}
-        json.dumps(record, allow_nan=False)
-        usable = all(isinstance(entry, dict) for entry in [*record["episodes"], *(record.get("sources") or [])])
-        spec = record.get("spec") or {}
-        numbers = (record.get("success_rate"), (spec.get("env") or {}).get("frame_skip"))
-        tables = (spec.get("render") or {}, record.get("versions") or {})
-        usable &= all(isinstance(table, dict) for table in tables)
-        usable &= all(number is None or isinstance(number, int | float) for number in numbers)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
-    return record if usable else None

@@ -13,8 +13,7 @@ import numpy as np
 
 from playslot_rl import keys
 from playslot_rl.data.contents import Contents
-from playslot_rl.data.metadata import REQUIRED
-from playslot_rl.datasets.assemble import read_record
+from playslot_rl.data.metadata import REQUIRED, read_record
 from playslot_rl.datasets.verify import require_sound
 
 MEBIBYTE = 2**20

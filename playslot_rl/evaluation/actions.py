@@ -17,7 +17,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,9 +29,9 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, cloning_methods
-from playslot_rl.config.weights import data_roots
 from playslot_rl.data.demonstrations import split_demonstrations, told_tasks, transitions
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.videos import open_videos, places
 from playslot_rl.data.views import chosen_episodes
 from playslot_rl.data.weighted import open_configured
 from playslot_rl.errors import CheckpointError, ConfigError, DataError
@@ -71,8 +70,8 @@ class Recorded:
         """The held-out demonstrations of the set that the run was trained on, or all of another that `data.demos`
         names. A DataError where none has actions, or a stage was trained on one."""
         named, trained = (c.data.demos or c.data.root for c in (config, run.config))
-        source = open_configured(config, named)
-        own = _places(named) == _places(trained)
+        own = places(named) == places(trained)
+        source = open_videos(config, named, "evaluate") if own else open_configured(config, named)
         if own:
             data = config.data  # where some are kept, these alone: models of videos may have seen others
             most, draw = (0, None) if data.held_out else (config.collect.validation_episodes, data.draw)
@@ -105,10 +104,6 @@ def require_unseen(
             f"{'were' if len(met) > 1 else 'was'} trained on, expected none: {cure} another set by data.demos="
         )
     return tuple(name for name, count in counts.items() if count is None and stages[name].meta["data"])
-
-
-def _places(roots: str) -> list[Path]:
-    return [Path(root.path).resolve() for root in data_roots(roots)]
 
 
 def _labelled(source: EpisodeFrames, episode: int) -> bool:

@@ -4,7 +4,6 @@ evaluation seeds, a fixed list, never one that was collected for training.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,15 +12,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl import keys
 from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.demonstrations import split_demonstrations
+from playslot_rl.data.metadata import RECORD_NAME, read_record
+from playslot_rl.data.places import Problems, parquet_files
+from playslot_rl.data.prints import of_pictures
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tables import read_table
 from playslot_rl.data.windows import split_episodes, spread_evenly
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.seeds.episodes import episode_seed
 
 Ints = npt.NDArray[np.int64]
+NOT_SAID = "the checkpoints do not say whether the world model"
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,7 @@ def _candidates(
             share, fits = float(meta.get("validation", config.validation)), source.lengths >= meta.get("clip_frames", 1)
             training, _ = split_episodes(source.episodes, share, int(meta.get("seed", 0)), fits, source.recorded)
             chosen = np.setdiff1d(chosen, training)
+        chosen = _apart(source, world, chosen)
         if len(chosen) and len(trained) == len(world):
             return chosen, "the world model's own videos, the episodes that its validation held out", True
         if len(chosen):
@@ -90,17 +96,25 @@ def _candidates(
             return chosen, why, False
         return quarter, "the world model's own videos, none of which were held out", False
     last = _policy_held_out(source, metas.get("policy", {}), config)
-    if len(chosen := usable[numbers >= source.recordings - last]):
-        unseen = bool(world) and all(int(meta.get("held_out", 0)) >= last for meta in world.values())
-        why = (
-            "training" if unseen else "the policy's training; the checkpoints do not say whether the world model's, too"
-        )
-        return chosen, f"the last {last} episodes, which are held out from {why}", unseen
-    if len(chosen := usable[numbers >= source.recordings - config.held_out]):
-        unseen = bool(world) and all(count == 0 for count in trained_on(source, world, chosen).values())
-        return chosen, f"the last {config.held_out} episodes, as data.held_out says", unseen
-    what = "the last quarter of the episodes; the checkpoints do not say whether the world model was trained on them"
-    return quarter, what, False
+    for count in filter(None, (last, config.held_out)):
+        chosen = usable[numbers >= source.recordings - count]
+        chosen = left if len(left := _apart(source, world, chosen)) else chosen
+        unseen = bool(world) and all(seen == 0 for seen in trained_on(source, world, chosen).values())
+        if len(chosen) and count == last:
+            unseen &= all(int(meta.get("held_out", 0)) >= last for meta in world.values())
+            why = "training" if unseen else f"the policy's training; {NOT_SAID}, too"
+            return chosen, f"the last {last} episodes, which are held out from {why}", unseen
+        if len(chosen):
+            return chosen, f"the last {count} episodes, as data.held_out says", unseen
+    return quarter, f"the last quarter of the episodes; {NOT_SAID} was trained on them", False
+
+
+def _apart(source: EpisodeFrames, metas: Mapping[str, Mapping[str, Any]], chosen: Ints) -> Ints:
+    """Those of some episodes that no stage says it was trained on: one recording can be in several data sets."""
+    seen = {origin for meta in metas.values() for origin in meta.get("trained_on") or ()}
+    if source.origins is None:
+        return chosen
+    return chosen[np.array([origin not in seen for origin in source.origins[chosen].tolist()], np.bool_)]
 
 
 def trained_on(
@@ -110,8 +124,15 @@ def trained_on(
     what it saw, or nobody knows which episodes these are.
     """
     there = None if source.origins is None else {*source.origins[chosen].tolist()}
-    seen = {name: None if there is None else meta.get("trained_on") for name, meta in metas.items()}
-    return {name: None if ones is None else len((there or set()) & {*ones}) for name, ones in seen.items()}
+
+    def count(ones: Iterable[str] | None) -> int | None:
+        if there is None or ones is None:
+            return None
+        # A stage that says nothing of pictures may have seen these: versions before knew none.
+        known = any(map(of_pictures, ones)) or not any(map(of_pictures, there))
+        return len(there & {*ones}) or (0 if known else None)
+
+    return {name: count(meta.get("trained_on")) for name, meta in metas.items()}
 
 
 def _last_quarter(source: EpisodeFrames, numbers: Ints) -> Ints:
@@ -148,34 +169,23 @@ def held_out_seeds(config: ExperimentConfig, seed: int, episodes: int, run: Path
 
 
 def recorded_seeds(root: Path) -> set[int]:
-    """Episode seeds that one of our data sets says it was collected with; empty for foreign data sets. A DataError
-    where `meta/playslot.json` is there but cannot be read.
+    """Episode seeds that a data set says it was collected with, in our record of it or in its column `seed`; empty for
+    foreign data sets. A DataError where there is a record that cannot be used, and no such column.
     """
-    path = root / "meta" / "playslot.json"
-    if not path.is_file():
-        return set()
-    try:
-        meta = json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise DataError(f"{path}: got {error}, expected JSON; collect the data set again") from error
-    return set(_seeds_in(meta))
-
-
-def _seeds_in(node: Any) -> Iterable[int]:
-    """All integers under a key `seed` or `seeds`, at any depth below the per-episode records."""
-    if isinstance(node, dict):
-        for key, value in node.items():
-            if key == "seeds" and isinstance(value, list):
-                yield from (int(v) for v in value if isinstance(v, int))
-            elif key == "episodes" and isinstance(value, list):
-                yield from (int(v["seed"]) for v in value if isinstance(v, dict) and isinstance(v.get("seed"), int))
-            else:
-                yield from _seeds_in(value)
+    record = read_record(root)
+    seeds = [entry.get("seed") for entry in (record or {}).get("episodes", ())]
+    for path in parquet_files(root, "data"):
+        table = read_table(path, Problems(), keys.FEATURE_SEED.__eq__)
+        if table is not None and table.num_columns:
+            seeds += np.unique(table.column(0).drop_null().to_numpy()).tolist()
+    if record is None and not seeds and (root / RECORD_NAME).is_file():
+        raise DataError(f"{root / RECORD_NAME}: got no record of episodes, expected JSON; collect the data set again")
+    return {seed for seed in seeds if isinstance(seed, int)}
 
 
 def data_folders(config: ExperimentConfig, run: Path | None = None) -> list[Path]:
     """Data sets the config names, then what is in the run's `data` folder."""
-    named = [Path(root.path) for root in data_roots(f"{config.data.root},{config.data.demos}")]
+    named = [Path(root.path).expanduser() for root in data_roots(f"{config.data.root},{config.data.demos}")]
     return [*named, *(sorted((run / "data").glob("*")) if run is not None else [])]
 
 

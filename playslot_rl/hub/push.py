@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from playslot_rl import keys
-from playslot_rl.datasets.assemble import read_record
+from playslot_rl.data.metadata import read_record
 from playslot_rl.datasets.info import DatasetSummary, info
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, HubError

@@ -32,7 +32,7 @@ from playslot_rl.data.demonstrations import (
 )
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.demonstrated import cloned, policy_taken_over

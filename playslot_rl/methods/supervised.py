@@ -14,7 +14,7 @@ from playslot_rl.data.demonstrations import moving_frames, real_actions
 from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.shares import own_noise, own_rows
 from playslot_rl.seeds.draws import StepGenerators

@@ -21,7 +21,7 @@ from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpis
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import parse_episodes
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.data.windows import sample_windows
 from playslot_rl.datasets.verify import verify
 from playslot_rl.envs import make_env
@@ -51,7 +51,7 @@ def set_rates(sizes: Sizes) -> dict[str, float]:
         found = verify(root)
         if not found.ok:
             raise DataError(f"bench: got a data set with {found.errors[0]}, expected a sound one")
-        source = open_source(root, cache=folder / "cache")
+        source = open_sources(root, cache=folder / "cache")
         few = replace(source, starts=source.starts[: sizes.parsed], lengths=source.lengths[: sizes.parsed])
         savi = SAVi(sizes.config.model.savi, sizes.config.env.image_size)
         took = in_turns(
@@ -70,8 +70,8 @@ def set_rates(sizes: Sizes) -> dict[str, float]:
 
 def window_readers(root: Path, cache: Path, sizes: Sizes) -> dict[str, Callable[[], Tensor]]:
     """What reads a batch of windows, float (B, T, 3, H, W) in [0, 1]."""
-    source = open_source(root, cache=cache)
-    streamed = open_source(root, cache=cache, buffer=len(source.frames) // 4)
+    source = open_sources(root, cache=cache)
+    streamed = open_sources(root, cache=cache, buffer=len(source.frames) // 4)
     clips, steps, generator = Clips(streamed, sizes.window, 0.0, 0), itertools.count(), np.random.default_rng(0)
 
     def cached() -> Tensor:

@@ -17,15 +17,13 @@ from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.plain import put
 from playslot_rl.config.roles import by_default, without
 from playslot_rl.config.stage_spec import StageSpec, group_of
-from playslot_rl.config.weights import data_roots
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.views import episode_range, split_tested
-from playslot_rl.data.weighted import open_configured, weighted
+from playslot_rl.data.videos import open_videos
 from playslot_rl.errors import CheckpointError, DataError
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK
@@ -51,28 +49,6 @@ _ROLES: Final[Mapping[str, Literal["train", "demos", ""]]] = {
 LABELS: Final = "behaviour.labelled_demos"
 PATIENCE: Final = 10.0
 """Seconds in which the children of a killed training end."""
-
-
-def open_videos(config: ExperimentConfig, roots: str, what: str, whole: bool = True) -> EpisodeFrames:
-    """Open the data sets of a stage, without the episodes that are kept for a test (`data.tested`); of `data.demos`
-    (empty: `data.root`) among several, or unless `whole` alone, without the demonstrations that are held out.
-
-    Raises:
-        DataError: none is named, or one cannot be read.
-    """
-    if not roots:
-        raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
-    named = data_roots(roots)
-    names = [root.path for root in named]
-    if config.data.tested:
-        return split_tested(open_configured(config, roots), config.data.tested)[0]
-    shown = config.data.demos or roots
-    if not config.data.held_out or shown not in names or (whole and len(names) == 1):
-        return open_configured(config, roots)
-    parts = {name: open_configured(config, name) for name in names}
-    free = split_demonstrations(parts[shown], None, config.data.held_out, 0).trained.recordings
-    parts[shown] = episode_range(parts[shown], 0, free)
-    return weighted([parts[name] for name in names], [root.weight for root in named])
 
 
 @dataclass(frozen=True)
@@ -241,8 +217,11 @@ class StageRecord:
         own = self
         if self.role and self.roots:  # a finished stage can be asked for without
             old = next(iter(done.meta["data"].values()), "none")
-            own = self if self.data.fingerprint == old else self._as(done)
+            own = self._as(done, old)
             facts.append(("data", own.data.fingerprint, old))
+            cameras, seen = (str(each).split(",") for each in (own.data.camera, done.meta.get("camera") or ""))
+            if any(seen):  # versions before named the first of several
+                facts.append(("data.camera", ",".join(cameras[: len(seen)]), ",".join(seen)))
             facts.append(("data.drawn", self.drawn or "false", done.meta.get("drawn") or "false"))
         if self.spec.labels and self.roots:
             facts.append((LABELS, self.labels, done.meta.get("labelled")))
@@ -260,12 +239,17 @@ class StageRecord:
         print(f"{self.name}: finished before ({done.meta.get('steps')} steps), skipped", flush=True)
         return done
 
-    def _as(self, done: StageCheckpoint) -> StageRecord:
-        """With as many demonstrations held out as from a finished model of videos: those of a policy come later."""
-        own, kept = self.config.data, done.meta.get("held_out")
-        if self.role != "train" or kept in (None, own.held_out):
+    def _as(self, done: StageCheckpoint, fingerprint: str) -> StageRecord:
+        """With as many demonstrations held out as from a finished model of videos: those of a policy come later, and
+        versions before held none out of sets that were named in two ways."""
+        own = self.config.data
+        if self.role != "train" or self.data.fingerprint == fingerprint:
             return self
-        return replace(self, config=replace(self.config, data=replace(own, held_out=kept)))
+        for kept in {done.meta.get("held_out") or 0, 0} - {own.held_out}:
+            other = replace(self, config=replace(self.config, data=replace(own, held_out=kept)))
+            if other.data.fingerprint == fingerprint:
+                return other
+        return self
 
     def finishes(self) -> dict[str, Any]:
         """Parts of `stored`, nested as there, that a finished stage must share."""

@@ -17,7 +17,7 @@ from playslot_rl.data.clips import Clips
 from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.slot_cache import slot_cache
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.frames import normalise
 from playslot_rl.losses.common import total_loss

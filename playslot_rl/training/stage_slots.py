@@ -14,7 +14,7 @@ from playslot_rl import keys
 from playslot_rl.colours import segmentation
 from playslot_rl.config import SlotsStageConfig
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.data.zoom import corners, magnified
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import psnr, to_uint8

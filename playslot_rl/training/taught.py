@@ -27,7 +27,7 @@ def taught(source: EpisodeFrames, config: ExperimentConfig, extra: Mapping[str, 
     if "clip_frames" in extra:
         fits = source.lengths >= extra["clip_frames"]
         training, _ = split_episodes(source.episodes, config.data.validation, config.seed, fits, source.recorded)
-    origins = [] if source.origins is None else sorted(set(source.origins[training].tolist()))
+    origins = None if source.origins is None else sorted(set(source.origins[training].tolist()))
     rest = mean_actions(source, extra.get("labelled_demos")) if demos else {"held_out": config.data.held_out}
     return {"trained_on": origins, **rest}
 

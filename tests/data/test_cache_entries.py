@@ -27,7 +27,7 @@ from playslot_rl.data.cache import (
     part_folder,
     room,
 )
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.storage.atomic import temporary_name
 from playslot_rl.storage.locks import NAME
@@ -117,14 +117,14 @@ def test_what_is_removed_between_making_and_opening_is_made_again(tmp_path: Path
 
 def test_a_data_set_beyond_the_limit_is_refused_and_leaves_nothing(foreign_images: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"data\.stream=true"):
-        open_source(foreign_images, cache=Cache(tmp_path, 10_000))
+        open_sources(foreign_images, cache=Cache(tmp_path, 10_000))
     assert entries(tmp_path) == []
     limit = Cache(tmp_path, 15 * 32 * 32 * 3 + 20_000)
-    source = open_source(foreign_images, cache=limit)
+    source = open_sources(foreign_images, cache=limit)
     old = an_entry(tmp_path, "old", 1000)
     assert len(source.frames) == 15
     with pytest.raises(DataError, match="in use"):
-        open_source(foreign_images, cache=limit, image_size=64, resize=True)
+        open_sources(foreign_images, cache=limit, image_size=64, resize=True)
     assert old.is_dir()
 
 

@@ -11,7 +11,7 @@ from foreign import write_foreign
 
 from playslot_rl.config.compose import compose
 from playslot_rl.data.contents import full_name, with_full_cameras
-from playslot_rl.data.source import open_source, open_sources
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.survey import survey
 from playslot_rl.errors import DataError
 from playslot_rl.runs import Run
@@ -60,10 +60,10 @@ def test_what_is_ambiguous_or_unknown_is_refused_with_the_list(typed: str, messa
 
 
 def test_all_readers_take_the_short_name_for_the_same_frames(two: Path, tmp_path: Path) -> None:
-    full, short = (open_source(two, name, tmp_path) for name in (SIDE, "side"))
+    full, short = (open_sources(two, name, tmp_path) for name in (SIDE, "side"))
     assert (short.camera, short.fingerprint) == (SIDE, full.fingerprint)
     assert np.array_equal(short.frames, full.frames)
-    streamed = open_source(two, "side", tmp_path, buffer=8)
+    streamed = open_sources(two, "side", tmp_path, buffer=8)
     assert (streamed.camera, streamed.fingerprint) == (SIDE, full.fingerprint)
     both = open_sources([two], f"top, {SIDE}", tmp_path)
     assert both.fingerprint == open_sources([two], f"{TOP},{SIDE}", tmp_path).fingerprint

@@ -27,7 +27,7 @@ def source() -> EpisodeFrames:
     return EpisodeFrames(
         frames=np.arange(72, dtype=np.uint8).reshape(6, 2, 2, 3),
         starts=np.array([0, 3, 4]), lengths=np.array([3, 1, 2]),
-        actions=np.arange(12, dtype=np.float32).reshape(6, 2) - 1, success=None, seeds=np.array([7, 8, 9]),
+        actions=np.arange(12, dtype=np.float32).reshape(6, 2) - 1, seeds=np.array([7, 8, 9]),
         fingerprint="whole", fps=10.0, task="", camera="",
     )  # fmt: skip
 
@@ -91,7 +91,7 @@ def test_sets_with_and_without_actions_are_one_whose_first_demonstrations_are_la
     for wanted, given in ((3, split), (None, split), (1, other)):
         with pytest.raises(DataError, match=r"^silent: got no actions, expected some .*: 2 have any"):
             require_finite(given, wanted)
-    assert concatenate([silent, silent]).actions is None
+    assert concatenate([silent, replace(silent, fingerprint="other")]).actions is None
     assert concatenate([acted, replace(acted, actions=np.zeros((6, 3), np.float32))]).actions is None
 
 
@@ -141,7 +141,7 @@ def test_a_draw_changes_who_comes_first_and_nothing_else(source: EpisodeFrames) 
 def test_few_demonstrations_of_a_draw_are_the_first_of_many(episodes: int, kept: int, measured: int) -> None:
     """Slot BC's labelled demonstrations are PlaySlot's, which trains on more of them."""
     frames, numbers = np.zeros((2 * episodes, 4, 4, 3), np.uint8), np.arange(episodes)
-    source = EpisodeFrames(frames, 2 * numbers, np.full(episodes, 2), None, None, numbers, "f", 10.0, "", "c")
+    source = EpisodeFrames(frames, 2 * numbers, np.full(episodes, 2), None, numbers, "f", 10.0, "", "c")
     orders = set()
     for draw in range(5):
         many = split_demonstrations(source, episodes - 5, kept, measured, draw)

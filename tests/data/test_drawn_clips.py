@@ -25,7 +25,7 @@ def settings(objects: int = 2, image_size: int = 64, **grid: int) -> EnvConfig:
 def clips(frames: int, stride: int = 1) -> DrawnClips:
     held_out = generate([0], 20, settings()).frames[0]
     one = np.zeros(1, np.int64)
-    source = EpisodeFrames(held_out, one, one + 21, None, None, None, "f", 10.0, "", "camera")
+    source = EpisodeFrames(held_out, one, one + 21, None, None, "f", 10.0, "", "camera")
     return DrawnClips(settings(), stride, source, frames, 0.1, 0)
 
 

@@ -17,7 +17,7 @@ from playslot_rl.data import frame_build, source
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.frame_build import FrameArray, build_frames, units
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 
 CAMERA = "observation.images.top"
 
@@ -52,8 +52,8 @@ def test_units_hold_every_episode_once_and_cross_no_file(foreign_images: Path, f
 
 @pytest.mark.integration
 def test_several_processes_make_the_same_array(foreign_images: Path, foreign_video: Path, tmp_path: Path) -> None:
-    one = open_source(foreign_images, cache=Cache(tmp_path / "one"))
-    two = open_source(foreign_images, cache=Cache(tmp_path / "two", workers=2))
+    one = open_sources(foreign_images, cache=Cache(tmp_path / "one"))
+    two = open_sources(foreign_images, cache=Cache(tmp_path / "two", workers=2))
     assert np.array_equal(one.frames[:], np.concatenate(foreign_frames()))
     assert np.array_equal(one.frames[:], two.frames[:])
     files = [next((tmp_path / name / "frames").glob("[0-9a-f]*")) for name in ("one", "two")]
@@ -74,9 +74,9 @@ def test_a_build_goes_on_where_it_was_interrupted(
     with monkeypatch.context() as patch:
         patch.setattr(frame_build, "write_text", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            open_source(foreign_images, cache=tmp_path)
+            open_sources(foreign_images, cache=tmp_path)
     assert decoded == [[0], [1]]
-    frames = open_source(foreign_images, cache=tmp_path).frames
+    frames = open_sources(foreign_images, cache=tmp_path).frames
     assert decoded == [[0], [1], [2]]
     assert np.array_equal(frames[:], np.concatenate(foreign_frames()))
 
@@ -111,8 +111,8 @@ def test_a_killed_build_is_finished_by_the_next_and_its_workers_die_with_it(
         "real = f.write_text\n"
         "def slow(path, text):\n    real(path, text); print('unit', flush=True); time.sleep(60)\n"
         "f.write_text = slow\n"
-        "from playslot_rl.data.source import open_source; from playslot_rl.data.cache import Cache\n"
-        "if __name__ == '__main__': open_source(sys.argv[1], cache=Cache(sys.argv[2], workers=2))"
+        "from playslot_rl.data.source import open_sources; from playslot_rl.data.cache import Cache\n"
+        "if __name__ == '__main__': open_sources(sys.argv[1], cache=Cache(sys.argv[2], workers=2))"
     )
     path = tmp_path / "script.py"
     path.write_text(script)
@@ -128,7 +128,7 @@ def test_a_killed_build_is_finished_by_the_next_and_its_workers_die_with_it(
     while any(Path(f"/proc/{pid}").exists() and _alive(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not any(_alive(pid) for pid in workers)
-    found = source.open_source(foreign_images, cache=tmp_path / "cache")
+    found = source.open_sources(foreign_images, cache=tmp_path / "cache")
     assert np.array_equal(found.frames[:], np.concatenate(foreign_frames()))
     assert not list((tmp_path / "cache" / "frames").glob(".*.part"))
 

@@ -11,7 +11,7 @@ import torch
 
 from playslot_rl.data.demonstrations import Demonstrations, transitions, with_copies
 from playslot_rl.data.slot_cache import slot_cache
-from playslot_rl.data.source import EpisodeFrames, open_source
+from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.data.views import DIRECTIONS, concatenate, first_demonstrations, shift_frames, shifted, shifted_copies
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config
@@ -19,7 +19,7 @@ from playslot_rl.testing import tiny_config
 
 @pytest.fixture
 def source(foreign_images: Path, tmp_path: Path) -> EpisodeFrames:
-    return open_source(foreign_images, cache=tmp_path)
+    return open_sources(foreign_images, cache=tmp_path)
 
 
 @pytest.mark.parametrize("offset", [(2, -3), (-1, 0), (0, 4)])

@@ -13,14 +13,14 @@ import torch
 from playslot_rl.data import slot_cache as module
 from playslot_rl.data.cache import entries
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
-from playslot_rl.data.source import EpisodeFrames, open_source
+from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config
 
 
 @pytest.fixture
 def source(foreign_images: Path, tmp_path: Path) -> EpisodeFrames:
-    return open_source(foreign_images, cache=tmp_path)
+    return open_sources(foreign_images, cache=tmp_path)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ import torch
 from foreign import LENGTHS, foreign_frames, write_foreign
 
 from playslot_rl.data.cache import build_once, cache_folder
-from playslot_rl.data.source import open_source, open_sources
+from playslot_rl.data.source import open_sources
 from playslot_rl.data.views import RowView
 from playslot_rl.errors import DataError, OutputError
 
@@ -29,7 +29,7 @@ def one_line(caught: pytest.ExceptionInfo[Any]) -> bool:
 
 
 def test_frames_actions_and_episodes_of_an_image_data_set(foreign_images: Path, tmp_path: Path) -> None:
-    source = open_source(foreign_images, cache=tmp_path)
+    source = open_sources(foreign_images, cache=tmp_path)
     assert np.array_equal(source.frames, np.concatenate(foreign_frames()))
     assert source.lengths.tolist() == list(LENGTHS)
     assert source.starts.tolist() == [0, 5, 8]
@@ -48,7 +48,7 @@ def test_frames_equal_those_of_lerobot(kind: str, request: pytest.FixtureRequest
 
     root: Path = request.getfixturevalue(f"foreign_{kind}")
     camera = "observation.images.top"
-    source = open_source(root, camera, tmp_path)
+    source = open_sources(root, camera, tmp_path)
     reference = LeRobotDataset("me/foreign", root=root, video_backend="pyav")
     assert len(reference) == len(source.frames)
     for row in range(len(reference)):
@@ -57,7 +57,7 @@ def test_frames_equal_those_of_lerobot(kind: str, request: pytest.FixtureRequest
 
 
 def test_lossless_video_is_close_to_what_was_recorded(foreign_video: Path, tmp_path: Path) -> None:
-    source = open_source(foreign_video, "observation.images.side", tmp_path)
+    source = open_sources(foreign_video, "observation.images.side", tmp_path)
     error = source.frames[:].astype(float) - np.concatenate(foreign_frames(64))
     assert np.abs(error).mean() < 2
 
@@ -68,28 +68,28 @@ def test_the_second_opening_decodes_nothing(
     from playslot_rl.data import frame_build as module
     from playslot_rl.data.contents import Contents
 
-    first = open_source(foreign_images, cache=tmp_path)
+    first = open_sources(foreign_images, cache=tmp_path)
     monkeypatch.setattr(module, "rgb_frames", None)
     monkeypatch.setattr(Contents, "file_hash", None)
-    second = open_source(foreign_images, cache=tmp_path)
+    second = open_sources(foreign_images, cache=tmp_path)
     assert np.array_equal(first.frames, second.frames)
     assert first.fingerprint == second.fingerprint
 
 
 def test_the_fingerprint_follows_the_content_not_the_place(foreign_images: Path, damaged: Path, tmp_path: Path) -> None:
-    one, copy = (open_source(root, cache=tmp_path / "cache") for root in (foreign_images, damaged))
+    one, copy = (open_sources(root, cache=tmp_path / "cache") for root in (foreign_images, damaged))
     assert one.fingerprint == copy.fingerprint
     assert len(list((tmp_path / "cache" / "frames").glob("[0-9a-f]*"))) == 1
     other = write_foreign(tmp_path / "other", "image", size=64)
-    assert open_source(other, cache=tmp_path / "cache").fingerprint != one.fingerprint
+    assert open_sources(other, cache=tmp_path / "cache").fingerprint != one.fingerprint
 
 
 def test_the_data_set_is_left_untouched(foreign_images: Path, tmp_path: Path) -> None:
     before = sorted((str(path), path.stat().st_mtime_ns) for path in foreign_images.rglob("*"))
-    open_source(foreign_images, cache=tmp_path)
+    open_sources(foreign_images, cache=tmp_path)
     assert sorted((str(path), path.stat().st_mtime_ns) for path in foreign_images.rglob("*")) == before
     with pytest.raises(DataError, match="inside the data set"):
-        open_source(foreign_images, cache=foreign_images / "cache")
+        open_sources(foreign_images, cache=foreign_images / "cache")
 
 
 def test_several_data_sets_are_read_as_one(foreign_images: Path, damaged: Path, tmp_path: Path) -> None:
@@ -105,25 +105,25 @@ def test_several_data_sets_are_read_as_one(foreign_images: Path, damaged: Path, 
     with pytest.raises(IndexError):
         both.frames[30]
     assert both.actions is not None
-    assert both.fingerprint != open_source(damaged, cache=tmp_path / "cache").fingerprint
+    assert both.fingerprint != open_sources(damaged, cache=tmp_path / "cache").fingerprint
 
 
 def test_frames_of_another_size_are_refused_or_resized(
     foreign_images: Path, foreign_video: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(DataError, match=r"got frames of 32x32 .*, expected 64x64") as caught:
-        open_source(foreign_images, cache=tmp_path, image_size=64)
+        open_sources(foreign_images, cache=tmp_path, image_size=64)
     assert one_line(caught)
-    assert open_source(foreign_images, cache=tmp_path, image_size=16, resize=True).image_size == (16, 16)
+    assert open_sources(foreign_images, cache=tmp_path, image_size=16, resize=True).image_size == (16, 16)
     with pytest.raises(DataError, match="expected 32x32 as in"):
         open_sources([foreign_images, foreign_video], "observation.images.top", tmp_path)
 
 
 def test_an_unknown_camera_lists_the_cameras(foreign_images: Path, foreign_video: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"data\.camera=wrist: .*expected one of: observation\.images\.top$"):
-        open_source(foreign_images, "wrist", tmp_path)
+        open_sources(foreign_images, "wrist", tmp_path)
     with pytest.raises(DataError, match=r"got 2 cameras \(observation\.images\.top, observation\.images\.side\)"):
-        open_source(foreign_video, "", tmp_path)
+        open_sources(foreign_video, "", tmp_path)
 
 
 def edited_info(root: Path, text: str = "") -> None:
@@ -188,14 +188,14 @@ def test_a_damaged_data_set_is_refused_and_leaves_no_cache(
     root = Path(shutil.copytree(request.getfixturevalue(f"foreign_{kind}"), tmp_path / "set"))
     damage(root)
     with pytest.raises(DataError, match=message) as caught:
-        open_source(root, "observation.images.top", tmp_path / "cache")
+        open_sources(root, "observation.images.top", tmp_path / "cache")
     assert one_line(caught)
     assert not list((tmp_path / "cache").rglob("*.npy"))
 
 
 def test_no_name_of_a_data_set_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"data\.root"):
-        open_source("", cache=tmp_path / "cache")
+        open_sources("", cache=tmp_path / "cache")
 
 
 def test_an_unfinalised_data_set_is_refused(tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ def test_an_unfinalised_data_set_is_refused(tmp_path: Path) -> None:
     process.start()
     process.join()
     with pytest.raises(DataError, match="never finalised"):
-        open_source(tmp_path / "set", cache=tmp_path / "cache")
+        open_sources(tmp_path / "set", cache=tmp_path / "cache")
 
 
 def write_unfinalised(root: Path) -> None:
@@ -217,17 +217,17 @@ def test_a_full_disk_leaves_no_cache(foreign_images: Path, tmp_path: Path, monke
     with monkeypatch.context() as patch:
         patch.setattr("os.fsync", full)
         with pytest.raises(OutputError, match="the disk is full"):
-            open_source(foreign_images, cache=tmp_path)
+            open_sources(foreign_images, cache=tmp_path)
     assert not list(tmp_path.rglob("*.npy"))
-    assert len(open_source(foreign_images, cache=tmp_path).frames) == 15
+    assert len(open_sources(foreign_images, cache=tmp_path).frames) == 15
 
 
 def test_a_damaged_cache_says_what_to_delete(foreign_images: Path, tmp_path: Path) -> None:
-    open_source(foreign_images, cache=tmp_path)
+    open_sources(foreign_images, cache=tmp_path)
     path = next(tmp_path.rglob("frames.npy"))
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(DataError, match=f"delete {path.parent}"):
-        open_source(foreign_images, cache=tmp_path)
+        open_sources(foreign_images, cache=tmp_path)
 
 
 @pytest.mark.integration

@@ -16,7 +16,7 @@ from playslot_rl.config import DataConfig
 from playslot_rl.data import agreement
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import parse_episodes, slot_cache
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.data.stream import FrameStream, ShuffleBuffer, streams_of
 from playslot_rl.data.views import concatenate, every, shifted
 from playslot_rl.data.weighted import open_configured
@@ -50,7 +50,7 @@ def test_streamed_frames_are_those_of_the_cache(
     kind: str, buffer: int, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     root = request.getfixturevalue(kind)
-    cached, streamed = open_source(root, CAMERA, tmp_path), open_source(root, CAMERA, tmp_path, buffer=buffer)
+    cached, streamed = open_sources(root, CAMERA, tmp_path), open_sources(root, CAMERA, tmp_path, buffer=buffer)
     rows = np.array([[14, 0, 3], [7, 7, 4]])
     assert np.array_equal(streamed.frames[rows], cached.frames[rows])
     assert np.array_equal(streamed.frames[5:9], cached.frames[5:9])
@@ -64,14 +64,14 @@ def test_streamed_frames_are_those_of_the_cache(
 
 
 def test_nothing_is_written_but_the_fingerprint(foreign_images: Path, tmp_path: Path) -> None:
-    open_source(foreign_images, cache=tmp_path, buffer=100).frames[np.arange(15)]
+    open_sources(foreign_images, cache=tmp_path, buffer=100).frames[np.arange(15)]
     assert {path.relative_to(tmp_path).parts[0] for path in tmp_path.rglob("*.*")} == {"fingerprints"}
 
 
 def test_episodes_outside_the_buffer_are_kept_only_while_they_are_read(
     foreign_images: Path, tmp_path: Path, decoded: list[list[int]]
 ) -> None:
-    frames = open_source(foreign_images, cache=tmp_path, buffer=24).frames  # six loose frames
+    frames = open_sources(foreign_images, cache=tmp_path, buffer=24).frames  # six loose frames
     frames[np.array([0, 1])]
     frames[np.array([2, 4])]
     assert decoded == [[0]]
@@ -85,7 +85,7 @@ def test_episodes_outside_the_buffer_are_kept_only_while_they_are_read(
 
 
 def test_what_has_made_way_takes_no_memory(foreign_images: Path, tmp_path: Path) -> None:
-    frames = open_source(foreign_images, cache=tmp_path, buffer=44).frames  # eleven loose frames
+    frames = open_sources(foreign_images, cache=tmp_path, buffer=44).frames  # eleven loose frames
     frames[np.arange(15)]
     kept = frames._loose.values()  # type: ignore[attr-defined]
     assert sum(map(len, kept)) <= 11
@@ -97,8 +97,8 @@ def test_slots_of_streamed_episodes_are_parsed_in_as_many_as_are_kept(
     foreign_images: Path, tmp_path: Path, buffer: int, together: list[list[int]], decoded: list[list[int]]
 ) -> None:
     savi = tiny_savi(initial="learned")
-    want = list(parse_episodes(open_source(foreign_images, cache=tmp_path), savi))
-    found = list(parse_episodes(open_source(foreign_images, cache=tmp_path, buffer=buffer), savi))
+    want = list(parse_episodes(open_sources(foreign_images, cache=tmp_path), savi))
+    found = list(parse_episodes(open_sources(foreign_images, cache=tmp_path, buffer=buffer), savi))
     for one, other in zip(want, found, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
     assert decoded == together
@@ -137,7 +137,7 @@ def test_the_buffer_moves_through_every_block_once_an_epoch() -> None:
 
 def test_a_resumed_run_reads_the_same_windows(foreign_images: Path, tmp_path: Path) -> None:
     def rows(steps: range) -> list[list[int]]:
-        clips = Clips(open_source(foreign_images, cache=tmp_path, buffer=4), 2, 0.0, seed=3)
+        clips = Clips(open_sources(foreign_images, cache=tmp_path, buffer=4), 2, 0.0, seed=3)
         return [clips.sample(3, StepGenerators(3, step).numpy("windows"))[:, 0].tolist() for step in steps]
 
     whole = rows(range(12))
@@ -146,7 +146,7 @@ def test_a_resumed_run_reads_the_same_windows(foreign_images: Path, tmp_path: Pa
 
 
 def test_a_buffer_as_large_as_the_set_draws_as_the_cache_does(foreign_images: Path, tmp_path: Path) -> None:
-    sets = [open_source(foreign_images, cache=tmp_path), open_source(foreign_images, cache=tmp_path, buffer=10_000)]
+    sets = [open_sources(foreign_images, cache=tmp_path), open_sources(foreign_images, cache=tmp_path, buffer=10_000)]
     cached, streamed = (Clips(s, 2, 0.0, seed=0) for s in sets)
     for step in range(20):
         one, other = (c.sample(50, StepGenerators(0, step).numpy("windows")) for c in (cached, streamed))
@@ -157,12 +157,12 @@ def test_a_buffer_that_has_room_for_all_blocks_holds_all_of_them_at_every_step(
     foreign_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not a stretch of the endless order, in which blocks come twice across an epoch's border."""
-    stream = open_source(foreign_images, cache=tmp_path, buffer=20)  # three blocks of five frames, and room for four
+    stream = open_sources(foreign_images, cache=tmp_path, buffer=20)  # three blocks of five frames, and room for four
     assert len(streams_of(stream.frames)[0].blocks) == 3
     buffer = ShuffleBuffer(stream.frames, stream.starts, stream.lengths - 1, np.zeros(3, int), np.ones(1), 0)
     assert all(buffer.episodes(step, 4).tolist() == [0, 1, 2] for step in range(50))
     assert capsys.readouterr().out == ""
-    small = open_source(foreign_images, cache=tmp_path, buffer=5)
+    small = open_sources(foreign_images, cache=tmp_path, buffer=5)
     ShuffleBuffer(small.frames, small.starts, small.lengths - 1, np.zeros(3, int), np.ones(1), 0)
     assert "note: data.shuffle_buffer=5 holds 1 of 3 blocks of episodes" in capsys.readouterr().out
     monkeypatch.setattr(processes, "_here", processes.Processes(1, 2))
@@ -184,8 +184,8 @@ def test_strides_shifts_and_several_sets_are_streamed_too(foreign_images: Path, 
         source = every(of, 2)  # type: ignore[arg-type]
         return concatenate([source, shifted(source, (1, 0))])
 
-    cached = made(open_source(foreign_images, cache=tmp_path))
-    streamed = made(open_source(foreign_images, cache=tmp_path, buffer=4))
+    cached = made(open_sources(foreign_images, cache=tmp_path))
+    streamed = made(open_sources(foreign_images, cache=tmp_path, buffer=4))
     assert len(streams_of(streamed.frames)) == 2  # type: ignore[attr-defined]
     clips = Clips(streamed, 2, 0.0, seed=0)  # type: ignore[arg-type]
     seen = set()
@@ -213,15 +213,15 @@ def test_a_config_streams_with_weights(foreign_images: Path, tmp_path: Path) -> 
 def test_slots_of_a_stream_are_those_of_the_cache(foreign_images: Path, tmp_path: Path) -> None:
     torch.manual_seed(0)
     savi = SAVi(replace(tiny_config().model.savi, decoder_channels=(16, 16)), 32)
-    cached = slot_cache(open_source(foreign_images, cache=tmp_path), savi, "f" * 16, tmp_path / "a")
-    streamed = slot_cache(open_source(foreign_images, cache=tmp_path, buffer=4), savi, "f" * 16, tmp_path / "b")
+    cached = slot_cache(open_sources(foreign_images, cache=tmp_path), savi, "f" * 16, tmp_path / "a")
+    streamed = slot_cache(open_sources(foreign_images, cache=tmp_path, buffer=4), savi, "f" * 16, tmp_path / "b")
     assert np.array_equal(cached, streamed)
 
 
 def test_frames_of_another_size_are_resized_or_refused(foreign_images: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected 64x64"):
-        open_source(foreign_images, cache=tmp_path, buffer=9, image_size=64)
-    resized = open_source(foreign_images, cache=tmp_path, buffer=9, image_size=64, resize=True)
-    expected = open_source(foreign_images, cache=tmp_path, image_size=64, resize=True)
+        open_sources(foreign_images, cache=tmp_path, buffer=9, image_size=64)
+    resized = open_sources(foreign_images, cache=tmp_path, buffer=9, image_size=64, resize=True)
+    expected = open_sources(foreign_images, cache=tmp_path, image_size=64, resize=True)
     assert np.array_equal(resized.frames[3:8], expected.frames[3:8])
     assert len(foreign_frames()) == resized.episodes

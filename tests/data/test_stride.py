@@ -9,13 +9,13 @@ import pytest
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.data.views import every
 from playslot_rl.data.weighted import open_configured
 
 
 def test_rows_of_each_episode_from_its_first_frame_on(foreign_images: Path, tmp_path: Path) -> None:
-    source = open_source(foreign_images, cache=tmp_path)  # episodes of 5, 3 and 7 frames
+    source = open_sources(foreign_images, cache=tmp_path)  # episodes of 5, 3 and 7 frames
     kept = every(source, 3)
     assert kept.lengths.tolist() == [2, 1, 3]
     assert kept.starts.tolist() == [0, 2, 3]
@@ -27,13 +27,13 @@ def test_rows_of_each_episode_from_its_first_frame_on(foreign_images: Path, tmp_
 
 
 def test_an_action_is_the_mean_of_those_up_to_the_next_kept_row(foreign_images: Path, tmp_path: Path) -> None:
-    kept = every(open_source(foreign_images, cache=tmp_path), 3)
+    kept = every(open_sources(foreign_images, cache=tmp_path), 3)
     # The t-th action is (t, -t); an episode's last one is padding.
     assert kept.require_actions()[:, 0].tolist() == [1, 3, 0.5, 1, 4, 6]
 
 
 def test_the_last_action_is_that_of_the_row_before_the_next_kept_one(foreign_images: Path, tmp_path: Path) -> None:
-    source = open_source(foreign_images, cache=tmp_path)
+    source = open_sources(foreign_images, cache=tmp_path)
     kept = every(source, 3, "last")
     assert kept.require_actions()[:, 0].tolist() == [2, 3, 1, 2, 5, 6]
     assert np.array_equal(kept.frames[:], every(source, 3).frames[:])
@@ -49,7 +49,7 @@ def test_the_config_chooses_it_and_names_it_only_then(foreign_images: Path, tmp_
 
 
 def test_another_stride_is_another_data_set_and_one_is_the_set_itself(foreign_images: Path, tmp_path: Path) -> None:
-    source = open_source(foreign_images, cache=tmp_path)
+    source = open_sources(foreign_images, cache=tmp_path)
     assert every(source, 1) is source
     assert len({every(source, stride).fingerprint for stride in (1, 2, 3)}) == 3
     with pytest.raises(ValueError, match="got 0, expected 1"):

@@ -34,7 +34,7 @@ def video(moves: list[list[int]]) -> EpisodeFrames:
     starts = np.cumsum([0, *lengths[:-1]])
     return EpisodeFrames(
         frames=whole, starts=starts, lengths=np.array(lengths), actions=np.full((len(whole), 4), np.nan, np.float32),
-        success=None, seeds=None, fingerprint="f", fps=10.0, task="", camera="",
+        seeds=None, fingerprint="f", fps=10.0, task="", camera="",
     )  # fmt: skip
 
 

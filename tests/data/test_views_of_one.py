@@ -27,7 +27,7 @@ def seen_by(camera: int, first: int = 0) -> EpisodeFrames:
     numbers = np.repeat(np.arange(len(LENGTHS)) + first, LENGTHS)
     frames = np.broadcast_to(10 * numbers[:, None, None, None] + camera, (len(numbers), 4, 4, 3)).astype(np.uint8)
     return EpisodeFrames(
-        frames, np.cumsum(LENGTHS) - LENGTHS, LENGTHS, np.repeat(numbers, 2).reshape(-1, 2).astype(np.float32), None,
+        frames, np.cumsum(LENGTHS) - LENGTHS, LENGTHS, np.repeat(numbers, 2).reshape(-1, 2).astype(np.float32),
         np.arange(len(LENGTHS)) + first, f"{camera}", 10.0, "", f"camera{camera}", name="set",
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ import torch
 from playslot_rl.config import DataConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
-from playslot_rl.data.source import EpisodeFrames, open_source
+from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.data.views import concatenate, episode_range, split_tested
 from playslot_rl.data.weighted import open_configured, weighted
 from playslot_rl.errors import DataError
@@ -28,7 +28,6 @@ def a_set(seed: int, lengths: list[int], **changes: object) -> EpisodeFrames:
         starts=np.cumsum(count) - count,
         lengths=count,
         actions=generator.random((sum(lengths), 2), np.float32),
-        success=None,
         seeds=None,
         fingerprint=f"{seed:016d}",
         fps=10.0,
@@ -151,7 +150,7 @@ def test_a_config_names_weights_and_a_plain_text_is_as_before(foreign_images: Pa
     assert np.array_equal(plain.starts, both.starts)
     assert (
         open_configured(config, str(foreign_images)).fingerprint
-        == open_source(foreign_images, cache=tmp_path).fingerprint
+        == open_sources(foreign_images, cache=tmp_path).fingerprint
     )
     assert len([entry for entry in (tmp_path / "frames").iterdir() if entry.is_dir()]) == 1  # one content, one cache
 

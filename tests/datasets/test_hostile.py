@@ -12,7 +12,7 @@ import pytest
 from hostile import CONTENT, HARMLESS, METADATA
 
 from playslot_rl import cli
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError
 
@@ -81,7 +81,7 @@ def test_training_reads_it_or_says_in_a_line_why_not(
 ) -> None:
     ROWS[name](hostile)
     try:
-        source = open_source(hostile, cache=tmp_path / "cache")
+        source = open_sources(hostile, cache=tmp_path / "cache")
     except DataError as error:
         said = str(error)
         source = None
@@ -122,10 +122,10 @@ def test_another_rate_of_pictures_is_not_needed_and_of_videos_refused(
     pictures, films = (Path(shutil.copytree(root, tmp_path / root.name)) for root in (images, video))
     for root in (pictures, films):
         edit_json(root, "meta/info.json", lambda info: info.update(fps=99))
-    assert open_source(pictures, cache=tmp_path / "cache").fps == 99
+    assert open_sources(pictures, cache=tmp_path / "cache").fps == 99
     assert "stage 1 does not need that" in capsys.readouterr().err
     with pytest.raises(DataError, match="got fps 99, expected the rate of its videos"):
-        open_source(films, "observation.images.top", cache=tmp_path / "cache")
+        open_sources(films, "observation.images.top", cache=tmp_path / "cache")
 
 
 def test_a_folder_of_the_hubs_cache_is_whole_though_its_files_are_links(images: Path, tmp_path: Path) -> None:
@@ -137,4 +137,4 @@ def test_a_folder_of_the_hubs_cache_is_whole_though_its_files_are_links(images: 
         link.parent.mkdir(parents=True, exist_ok=True)
         link.symlink_to(blobs / str(number))
     assert verify(snapshot).errors == ()
-    assert len(open_source(snapshot, cache=tmp_path / "cache").frames) == 15
+    assert len(open_sources(snapshot, cache=tmp_path / "cache").frames) == 15

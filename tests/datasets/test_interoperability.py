@@ -9,7 +9,7 @@ import pytest
 from damage import load
 
 from playslot_rl import keys
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 
 pytestmark = pytest.mark.integration
 
@@ -24,7 +24,7 @@ def test_lerobot_reads_windows_of_ours_with_equal_frames(made: str, ours: Path, 
 
         root = tmp_path / "all"
         merge([ours, Path(shutil.copytree(ours, tmp_path / "copy"))], root)
-    source = open_source(root, cache=tmp_path / "cache")
+    source = open_sources(root, cache=tmp_path / "cache")
     fps = round(source.fps)
     dataset = load(root, delta_timestamps={keys.FEATURE_IMAGE: [-1 / fps, 0.0, 1 / fps], keys.FEATURE_ACTION: [0.0]})
     assert len(dataset) == len(source.frames) > 0

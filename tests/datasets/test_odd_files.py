@@ -18,7 +18,7 @@ from damage import CAMERA, ROWS, edit_column, edit_json, truncate
 from PIL import Image
 
 from playslot_rl.data.metadata import read_info
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.info import info
 from playslot_rl.datasets.merge import merge
 from playslot_rl.datasets.repair import repair
@@ -66,7 +66,7 @@ def with_picture(root: Path, content: bytes) -> Path:
 def test_pictures_of_every_kind_are_read_as_what_they_show(name: str, broken: Path, tmp_path: Path) -> None:
     content, expected = PICTURES[name]
     with_picture(broken, content)
-    assert np.array_equal(open_source(broken, cache=tmp_path / "cache").frames[6], expected)
+    assert np.array_equal(open_sources(broken, cache=tmp_path / "cache").frames[6], expected)
     assert not [line for line in verify(broken).errors if "decoded" in line]
 
 
@@ -104,7 +104,7 @@ def test_bombs_and_what_is_no_picture_are_refused_before_memory_is_spent(
     with_picture(broken, content)
     tracemalloc.start()
     with pytest.raises(DataError, match=message) as refused:
-        open_source(broken, cache=tmp_path / "cache")
+        open_sources(broken, cache=tmp_path / "cache")
     result = verify(broken)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -117,9 +117,9 @@ def test_half_a_video_is_refused_by_training_and_named_by_verify(broken_video: P
     path = next(broken_video.glob("videos/*top/*/*.mp4"))
     truncate(path, 0.5)
     with pytest.raises(DataError, match=f"{path}: cannot decode the frame at"):
-        open_source(broken_video, CAMERA, cache=tmp_path / "cache")
+        open_sources(broken_video, CAMERA, cache=tmp_path / "cache")
     assert any(str(path) in line for line in verify(broken_video).errors)
-    other = open_source(broken_video, "observation.images.side", cache=tmp_path / "cache")
+    other = open_sources(broken_video, "observation.images.side", cache=tmp_path / "cache")
     assert len(other.frames) == 15
 
 
@@ -136,7 +136,7 @@ def test_a_video_of_another_rate_than_stated_is_named_with_both(broken_video: Pa
     quick.replace(path)
     message = "got a video of 20 frames a second, expected 10 as in meta/info.json"
     with pytest.raises(DataError, match=message):
-        open_source(broken_video, CAMERA, cache=tmp_path / "cache")
+        open_sources(broken_video, CAMERA, cache=tmp_path / "cache")
     result = verify(broken_video)
     assert any(message in line for line in result.errors)
     assert result.lines()[-1].endswith("errors), 3 episodes, 15 frames in its rows")
@@ -146,7 +146,7 @@ def test_clips_without_a_set_are_shown_the_page_that_makes_one(tmp_path: Path) -
     for clips in (False, True):
         if clips:
             (tmp_path / "one.mp4").touch()
-        for reads in (open_source, read_info):
+        for reads in (open_sources, read_info):
             with pytest.raises(DataError, match=r"got no meta/info\.json") as caught:
                 reads(tmp_path)
             assert ("docs/tutorials/your-own-videos.md" in str(caught.value)) == clips
@@ -159,7 +159,7 @@ def test_a_video_with_more_pixels_than_any_is_refused_by_its_header(
 
     monkeypatch.setattr(frames, "LARGEST_PICTURE", 64 * 64 - 1)
     with pytest.raises(DataError, match="got frames of 64x64, expected fewer pixels"):
-        open_source(broken_video, CAMERA, cache=tmp_path / "cache")
+        open_sources(broken_video, CAMERA, cache=tmp_path / "cache")
 
 
 APPLE = b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X        " + bytes(4000)
@@ -190,7 +190,7 @@ def test_files_of_other_systems_are_named_and_passed_over(
     assert [line for line in verify(root).warnings if f"{root / place}: got a file of another" in line]
     same_rows(root, source)
     assert info(root).frames == 15
-    assert len(open_source(root, CAMERA, cache=tmp_path / "cache").frames) == 15
+    assert len(open_sources(root, CAMERA, cache=tmp_path / "cache").frames) == 15
     noted = capsys.readouterr().err
     assert (str(root / place) in noted) == place.endswith(".parquet")
     merge([root, source], tmp_path / "merged")
@@ -212,7 +212,7 @@ def test_a_byte_order_mark_is_read_past(place: str, broken: Path, images: Path, 
     (broken / place).write_bytes(b"\xef\xbb\xbf" + (broken / place).read_bytes())
     same_rows(broken, images)
     assert ["byte-order mark" in line for line in verify(broken).warnings] == [True]
-    assert len(open_source(broken, cache=tmp_path / "cache").frames) == 15
+    assert len(open_sources(broken, cache=tmp_path / "cache").frames) == 15
     merge([broken, images], tmp_path / "merged")
     assert (tmp_path / "merged" / place).read_bytes().startswith(b"{")
 
@@ -235,7 +235,7 @@ def test_rows_whose_order_nobody_knows_are_not_trained_on(name: str, broken: Pat
     change, message = ORDER[name]
     change(broken)
     with pytest.raises(DataError, match=message):
-        open_source(broken, cache=tmp_path / "cache")
+        open_sources(broken, cache=tmp_path / "cache")
 
 
 def test_a_repair_says_what_is_gone_of_a_set_that_says_it_had_a_trillion_episodes(broken: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sketchy_layout import CAMERAS, LENGTHS, colour_of, example, frame_record, name_of, timestep, write_sketchy
 
-from playslot_rl.data.source import open_source, open_sources
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.sketchy import convert_sketchy, split_episodes
 from playslot_rl.errors import ConfigError, DataError, OutputError
 
@@ -51,8 +51,8 @@ def test_the_split_is_the_papers_and_keeps_its_proportion() -> None:
 
 
 def test_demonstrations_become_episodes_in_the_order_of_their_files(converted: Path, tmp_path: Path) -> None:
-    train = open_source(converted / "train", "observation.images.front_left", tmp_path)
-    held_out = open_source(converted / "eval", "observation.images.front_left", tmp_path)
+    train = open_sources(converted / "train", "observation.images.front_left", tmp_path)
+    held_out = open_sources(converted / "eval", "observation.images.front_left", tmp_path)
     assert (*train.lengths, *held_out.lengths) == LENGTHS, "the agent's episode is no demonstration"
     assert (train.fps, train.image_size, train.task) == (10.0, (64, 64), "lift_green")
     for episode in range(4):
@@ -93,7 +93,7 @@ def test_both_cameras_train_as_twice_the_episodes(converted: Path, tmp_path: Pat
 def test_cameras_size_and_number_can_be_chosen(published: Path, tmp_path: Path) -> None:
     made = convert_sketchy(published, tmp_path / "out", cameras=["back_left"], image_size=32, episodes=2)
     assert made == {"train": 1, "eval": 1}
-    source = open_source(tmp_path / "out" / "train", cache=tmp_path / "cache")
+    source = open_sources(tmp_path / "out" / "train", cache=tmp_path / "cache")
     assert (source.camera, source.image_size) == ("observation.images.back_left", (32, 32))
 
 

@@ -22,4 +22,4 @@ def videos(episodes: int = EPISODES, length: int = LENGTH, moving: bool = True) 
             at = np.clip(at + 4 * actions[row, :2], 0, 56)
     starts = np.arange(episodes, dtype=np.int64) * length
     lengths = np.full(episodes, length, np.int64)
-    return EpisodeFrames(frames, starts, lengths, actions, None, None, "print", 10.0, "", "camera")
+    return EpisodeFrames(frames, starts, lengths, actions, None, "print", 10.0, "", "camera")

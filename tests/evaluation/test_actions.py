@@ -35,7 +35,7 @@ def recorded(said: list[list[int]], done: list[list[float]]) -> EpisodeFrames:
     frames[:, 0, 0, :2] = said
     lengths = np.array(LENGTHS)
     starts, actions = np.cumsum(lengths) - lengths, np.float32(done)
-    return EpisodeFrames(frames, starts, lengths, actions, None, None, "print", 10.0, "", "camera")
+    return EpisodeFrames(frames, starts, lengths, actions, None, "print", 10.0, "", "camera")
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def source() -> EpisodeFrames:
     """Four episodes of two frames, a to d."""
     frames, starts = np.zeros((8, 8, 8, 3), np.uint8), np.arange(0, 8, 2)
     actions, names = np.zeros((8, 1), np.float32), np.array(["a", "b", "c", "d"])
-    known = EpisodeFrames(frames, starts, np.full(4, 2), actions, None, None, "print", 10.0, "", "camera")
+    known = EpisodeFrames(frames, starts, np.full(4, 2), actions, None, "print", 10.0, "", "camera")
     return replace(known, origins=names)
 
 

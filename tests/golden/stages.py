@@ -85,7 +85,7 @@ def few_videos(image_size: int, action_dim: int) -> EpisodeFrames:
     return EpisodeFrames(
         frames=frames, starts=np.arange(8) * 8, lengths=np.full(8, 8),
         actions=numbers.uniform(-1, 1, (rows, action_dim)).astype(np.float32),
-        success=None, seeds=np.arange(8), fingerprint="data", fps=10.0, task="", camera="",
+        seeds=np.arange(8), fingerprint="data", fps=10.0, task="", camera="",
         states=numbers.normal(size=(rows, 4)).astype(np.float32),
     )  # fmt: skip
 

@@ -74,10 +74,10 @@ def _command(words: list[str]) -> int:
 
 
 def _stream(root: str, cache: str) -> dict[str, Any]:
-    from playslot_rl.data.source import open_source
+    from playslot_rl.data.source import open_sources
 
     with contextlib.redirect_stdout(io.StringIO()) as said:
-        source = open_source(root, cache=cache, buffer=1000)
+        source = open_sources(root, cache=cache, buffer=1000)
         frames = source.frames[:]
     actions = None if source.actions is None else source.actions.tolist()
     return {

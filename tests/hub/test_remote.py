@@ -12,7 +12,7 @@ from fake_hub import FakeHub
 from hub_contents import Fault
 
 from playslot_rl.cli import main
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 
 pytestmark = pytest.mark.integration
 
@@ -41,7 +41,7 @@ def put(hub: FakeHub, root: Path, **more: bytes) -> str:
 def test_frames_are_those_of_the_folder(made: tuple[Path, str], hub: FakeHub, client: Client, tmp_path: Path) -> None:
     root, storage = made
     put(hub, root)
-    here, there = open_source(root, cache=tmp_path), client("stream", root=ADDRESS, cache=tmp_path)
+    here, there = open_sources(root, cache=tmp_path), client("stream", root=ADDRESS, cache=tmp_path)
     assert "error" not in there, there
     assert there["frames"] == hashlib.sha256(here.frames[:].tobytes()).hexdigest()
     assert tuple(there["shape"]) == here.frames.shape

@@ -25,7 +25,6 @@ def moving_square(episodes: int = 4, length: int = 6, size: int = 32, seed: int 
         starts=np.arange(episodes) * length,
         lengths=np.full(episodes, length),
         actions=actions,
-        success=None,
         seeds=np.arange(episodes),
         fingerprint="square",
         fps=10.0,

@@ -62,7 +62,6 @@ def make_source(frames: int = FRAMES) -> EpisodeFrames:
         starts=np.arange(EPISODES) * frames,
         lengths=np.full(EPISODES, frames),
         actions=np.stack(actions),
-        success=None,
         seeds=np.arange(EPISODES),
         fingerprint="0" * 16,
         fps=10.0,

@@ -121,11 +121,11 @@ def test_an_animation_shows_the_recorded_frames_beside(agent: Agent, robots: Rec
 
 
 def test_a_recording_goes_with_the_data_that_the_model_was_trained_on(session: PlaySession, tmp_path: Path) -> None:
-    from playslot_rl.data.source import open_source
+    from playslot_rl.data.source import open_sources
 
     session.press(1)
     folder = record(session, tmp_path / "play", camera="observation.images.wrist")
-    again = open_source(folder / "dataset", "observation.images.wrist", tmp_path / "cache")
+    again = open_sources(folder / "dataset", "observation.images.wrist", tmp_path / "cache")
     assert np.array_equal(again.frames[0], session.timeline.moments[0].frame)
 
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from playslot_rl import keys
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError
 from playslot_rl.play import pictures, recording
@@ -38,7 +38,7 @@ def test_a_recording_is_a_sound_data_set(session: PlaySession, tmp_path: Path, s
     result = verify(folder / "dataset")
     assert result.ok, result.lines()
     assert (result.episodes, result.frames) == (1, 5)
-    source = open_source(folder / "dataset", cache=tmp_path / "cache")
+    source = open_sources(folder / "dataset", cache=tmp_path / "cache")
     moments = session.timeline.moments
     seen = [moments[0], moments[1], moments[4], moments[5], moments[6]]
     want = [moment.frame if shown == "imagined" else moment.true for moment in seen]

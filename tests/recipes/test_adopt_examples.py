@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import smoke
 
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.verify import verify
 
 pytestmark = pytest.mark.integration
@@ -49,7 +49,7 @@ def test_plain_videos_become_a_sound_set_with_their_frames(tmp_path: Path, monke
     exec(OF_CLIPS[0], {})
     made = verify("data/clips")
     assert (made.errors, made.episodes, made.frames) == ((), 2, 7)
-    source = open_source("data/clips", cache=tmp_path / "cache", image_size=64, resize=True)
+    source = open_sources("data/clips", cache=tmp_path / "cache", image_size=64, resize=True)
     assert (source.lengths.tolist(), source.fps) == ([3, 4], 12)
     levels = np.asarray(source.frames[:]).mean(axis=(1, 2, 3))
     assert np.abs(levels - ([40] * 3 + [200] * 4)).max() < 6

@@ -12,7 +12,7 @@ from commands import ONE_CORE, playslot, refused
 from playslot_rl.collectors.journal import CollectionSpec
 from playslot_rl.config import EnvConfig, GridConfig
 from playslot_rl.config.compose import compose
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.envs.grid_shapes import generate, moves_of
 
 pytestmark = pytest.mark.integration
@@ -78,7 +78,7 @@ def test_collected_clips_are_those_of_their_seeds(tmp_path: Path) -> None:
     wanted = ("env=grid_shapes", "env.grid.objects=3", "env.action_dim=6", "episodes=3", "collect.random_steps=5")
     done = playslot("collect", *wanted, "seed=2", f"out={tmp_path / 'set'}", *ONE_CORE)
     assert done.code == 0, done.err
-    source = open_source(tmp_path / "set", cache=tmp_path / "cache")
+    source = open_sources(tmp_path / "set", cache=tmp_path / "cache")
     assert source.seeds is not None
     assert source.actions is not None
     assert source.seeds.tolist() == [2_000_000, 2_000_001, 2_000_002]

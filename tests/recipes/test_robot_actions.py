@@ -16,7 +16,7 @@ from robot import CAMERA, CONSTANT, NAMES, OUTLIER, VALUE, edit_stats, ends, met
 
 import playslot_rl
 from playslot_rl.config.compose import compose
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.adoption import Decisions, for_frames
 from playslot_rl.datasets.survey import survey
 from playslot_rl.envs.pixel_task import PixelTask
@@ -71,7 +71,7 @@ def policy(trained: tuple[Path, Done], tmp_path_factory: pytest.TempPathFactory)
 @pytest.fixture
 def frames(arm: Path) -> np.ndarray[Any, Any]:
     """Frames of two episodes, (12, 64, 64, 3)."""
-    source = open_source(arm)
+    source = open_sources(arm)
     return np.concatenate([source.frames[:6], source.frames[60:66]])
 
 
@@ -252,7 +252,7 @@ def test_a_simulator_is_stepped_in_the_robots_units(
 def test_statistics_that_are_none_change_nothing(trained: tuple[Path, Done], arm: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(arm, tmp_path / "set")
     edit_stats(copy, min=[float("nan")] * 6, max=[float("nan")] * 6, q01=None)
-    known = open_source(copy).limits
+    known = open_sources(copy).limits
     assert known is not None
     assert known.plain() == meta_of(trained[0], "policy")["actions"]
     run = shutil.copytree(trained[0], tmp_path / "run")
@@ -317,7 +317,7 @@ def test_our_own_sets_keep_their_actions_and_their_weights(shared_run: Path) -> 
     assert meta_of(shared_run, "policy")["actions"] is None
     weights = load_tensors(shared_run / "policy/checkpoint/weights.safetensors")
     assert not any("action_range" in name for name in weights)
-    assert open_source(shared_run / "data/expert").limits is None
+    assert open_sources(shared_run / "data/expert").limits is None
 
 
 def test_no_other_camera_is_meant(policy: Path) -> None:

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import plugins
 from playslot_rl.config.methods import METHODS, cloning_methods, method_stage
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.runs import Run
 
 pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("thin_resnets")]
@@ -58,7 +58,7 @@ def test_every_method_learns_and_is_measured_without_a_simulator_in_the_robots_u
     result = json.loads((run / "evaluation/actions/eval_info.json").read_text())
     assert (result["method"], result["episodes"], result["rows"]) == (method, 2, 2 * (LENGTH - 1))
     # By hand: one episode alone, frame by frame, as a robot would be told.
-    errors, source = [], open_source(arm)
+    errors, source = [], open_sources(arm)
     actor.eval()
     for number, episode in enumerate((4, 5)):
         loop = ClosedLoop(actor)

@@ -137,11 +137,11 @@ def test_frames_of_another_size_are_resized_as_those_of_the_training_to_the_last
 
     import playslot_rl
     from lerobot_policy_playslot.modeling_playslot import PlaySlotPolicy
-    from playslot_rl.data.source import open_source
+    from playslot_rl.data.source import open_sources
     from playslot_rl.data.weighted import open_configured
 
     small = open_configured(compose([f"run={strided}"], "play"), str(recordings))
-    large = open_source(recordings)
+    large = open_sources(recordings)
     rows = np.arange(0, LAST := int(large.lengths[0]), 3)
     assert LAST == 12
     whole, seen = np.stack([large.frames[row] for row in rows]), small.frames[small.episode_rows(0)]

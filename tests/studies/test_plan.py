@@ -213,7 +213,7 @@ SETS = {
 
 def demonstrations(episodes: int) -> EpisodeFrames:
     frames, one = np.zeros((2 * episodes, 4, 4, 3), np.uint8), np.arange(episodes)
-    return EpisodeFrames(frames, 2 * one, np.full(episodes, 2), None, None, one, "f", 10.0, "", "c")
+    return EpisodeFrames(frames, 2 * one, np.full(episodes, 2), None, one, "f", 10.0, "", "c")
 
 
 def built_on(episodes: int, typed: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:

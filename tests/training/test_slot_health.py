@@ -35,7 +35,7 @@ def videos() -> EpisodeFrames:
     for t in range(20):
         frames[t, 8:16, t : t + 8] = 200
     starts, lengths = np.arange(0, 20, 5, dtype=np.int64), np.full(4, 5, np.int64)
-    return EpisodeFrames(frames, starts, lengths, None, None, None, "f", 10.0, "", "camera")
+    return EpisodeFrames(frames, starts, lengths, None, None, "f", 10.0, "", "camera")
 
 
 def stage(steps: int = 4, segmented: Callable[[SAVi], Mapping[str, float]] | None = None) -> SlotsStage:

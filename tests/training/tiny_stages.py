@@ -91,7 +91,7 @@ def videos(size: int) -> EpisodeFrames:
         frames[t, at : at + 6, size // 4 : size // 4 + 6] = 200 - 20 * (t // 7)
     starts, lengths = np.arange(0, 42, 7, dtype=np.int64), np.full(6, 7, np.int64)
     actions = generator.uniform(-1, 1, (42, 2)).astype(np.float32)
-    return EpisodeFrames(frames, starts, lengths, actions, None, None, "f", 10.0, "", "camera")
+    return EpisodeFrames(frames, starts, lengths, actions, None, "f", 10.0, "", "camera")
 
 
 def clips(size: int, frames: int) -> Clips:

@@ -36,7 +36,7 @@ from torch.nn import functional as F
 
 from playslot_rl import keys
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.frames import IMAGENET_MEAN, IMAGENET_STD, normalise, psnr
 from playslot_rl.losses.common import total_loss
 from playslot_rl.methods.caddy.action import ActionInformation, divergence, joint_distribution, mutual_information

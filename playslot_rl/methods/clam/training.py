@@ -25,7 +25,7 @@ from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.methods.clam.method import NAME, CLAMConfig
 from playslot_rl.methods.clam.model import Forward, Inverse

@@ -22,7 +22,7 @@ from playslot_rl.config.stage_spec import group_of
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import require_finite
 from playslot_rl.data.neighbours import in_batches
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.methods.cloning import action_stage
 from playslot_rl.methods.frozen_encoder.method import EncoderBCConfig

@@ -28,7 +28,7 @@ from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.neighbours import Ends, in_batches, pairs_at
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.frames import normalise
 from playslot_rl.methods.cloning import cloning, inferred
 from playslot_rl.methods.laom.method import NAME, LAOMConfig

@@ -30,7 +30,7 @@ from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import normalise
 from playslot_rl.methods.cloning import LatentCloning, cloning, inferred

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.frames import normalise, psnr
 from playslot_rl.losses.common import draw_frames, of_frames
 from playslot_rl.methods.svg.method import SVGConfig

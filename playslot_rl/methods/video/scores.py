@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.evaluation.video import frame_scores
 from playslot_rl.frames import normalise, to_uint8
 from playslot_rl.methods.caddy.model import CADDY

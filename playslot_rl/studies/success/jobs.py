@@ -17,8 +17,8 @@ from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data.agreement import open_files
 from playslot_rl.data.demonstrations import drawn_among, split_demonstrations
+from playslot_rl.data.videos import open_videos
 from playslot_rl.data.views import first_demonstrations
-from playslot_rl.data.weighted import open_configured
 from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.actions import require_unseen
@@ -27,7 +27,6 @@ from playslot_rl.methods.training import of_recorded, train_model
 from playslot_rl.runs import Run
 from playslot_rl.studies.launch import train
 from playslot_rl.studies.study import Job, absolute, absolute_roots, computed, fingerprint_of, job_config
-from playslot_rl.training.record import open_videos
 
 
 @dataclass(frozen=True)
@@ -241,7 +240,7 @@ def _recorded_elsewhere(config: ExperimentConfig) -> ExperimentConfig:
         own = replace(own, demos=(max(count - held, 1),))
     config = replace(config, data=data, compare=own, collect=collect)
     check_demos(config, count - held, f"data.demos={demos} beside {held} that are held out")
-    source = split_demonstrations(open_configured(config, demos), None, held, 0).held_out
+    source = split_demonstrations(open_videos(config, demos, "compare"), None, held, 0).held_out
     if source is not None and uses_slots(config):
         for run in filter(None, world_runs(config)):
             require_unseen(source, Run.open(run).world_stages, held)

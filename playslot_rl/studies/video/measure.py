@@ -138,7 +138,9 @@ class VideoMeasure:
 
     def __init__(self, config: ExperimentConfig) -> None:
         own = config.compare_video
-        data = replace(config.data, tested=own.tested if config.data.root and not own.test else 0.0)
+        tested = own.tested if config.data.root and not own.test else 0.0
+        held_out = 0 if tested else config.data.held_out  # the trainings hold out none
+        data = replace(config.data, held_out=held_out, tested=tested)
         self.config = replace(config, data=data, demos=None)
         self.launcher: tuple[str, Sequence[str]] = (own.launcher, own.hydra)
         self._jobs, self._lpips_reason = dict[VideoJob, Record](), ""

@@ -16,12 +16,12 @@ from playslot_rl.collectors import collect
 from playslot_rl.collectors.collection import collect_demos, collect_videos
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.compare_video import method_of
-from playslot_rl.config.weights import data_roots
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.views import split_tested
+from playslot_rl.data.videos import open_videos, place, places
+from playslot_rl.data.views import IntArray, split_tested
 from playslot_rl.data.weighted import open_configured
-from playslot_rl.data.windows import IntArray, spread_windows
+from playslot_rl.data.windows import spread_windows
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.evaluation.video import open_lpips
@@ -34,7 +34,6 @@ from playslot_rl.storage.atomic import json_or_nothing, write_json
 from playslot_rl.storage.checkpoints import require_config
 from playslot_rl.studies.launch import train
 from playslot_rl.studies.video.jobs import uses_slots
-from playslot_rl.training.record import open_videos
 
 
 def test_sets(config: ExperimentConfig) -> dict[str, str]:
@@ -139,10 +138,9 @@ def check_clips(config: ExperimentConfig) -> None:
     """
     own = config.compare_video
     trained = open_videos(config, config.data.root, "compare-video", False)
-    folders = {Path(root.path).resolve() for root in data_roots(config.data.root)}
     for tested in tested_clips(config):
         test = test_sets(config)[tested.label]
-        if test and (Path(test).resolve() in folders or tested.source.fingerprint == trained.fingerprint):
+        if test and (place(test) in places(config.data.root) or tested.source.fingerprint == trained.fingerprint):
             raise ConfigError(
                 f"compare_video.test={test}: got videos of data.root, which models are trained on, expected others: "
                 "leave it out to keep a tenth of data.root's episodes"

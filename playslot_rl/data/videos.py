@@ -1,0 +1,80 @@
+"""What of the data sets that a command names a stage is shown: all but the episodes that are kept to measure on, and
+those are told here alone, by where a set lies, however its name is written.
+
+    kept for a test           `data.tested`, a share of the episodes, of any sets
+    held-out demonstrations   of what is left of `data.demos` (empty: what is named) the last `data.held_out`
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from playslot_rl.config import ExperimentConfig
+from playslot_rl.config.weights import data_roots, is_remote
+from playslot_rl.data.demonstrations import free_demonstrations
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import IntArray, chosen_episodes, episode_range, split_tested, tested_numbers
+from playslot_rl.data.weighted import open_configured, weighted
+from playslot_rl.errors import DataError
+
+
+def place(root: str) -> str:
+    """Where a data set lies: its folder without links, or its address on the Hub."""
+    return root.rstrip("/") if is_remote(root) else str(Path(root).expanduser().resolve())
+
+
+def places(roots: str) -> list[str]:
+    """Of each of several data sets."""
+    return [place(root.path) for root in data_roots(roots)]
+
+
+def open_videos(config: ExperimentConfig, roots: str, what: str, whole: bool = True) -> EpisodeFrames:
+    """Open the data sets of a stage without what is kept for a test and without held-out demonstrations; with these
+    where `whole` and all of the sets are demonstrations: who takes them holds out the last ones.
+
+    Raises:
+        DataError: none is named, one cannot be read, or nothing is left.
+    """
+    if not roots:
+        raise DataError(f"{what}: got no data set, expected data.root=DIR; record one by `playslot collect`")
+    data = config.data
+    here, shown = {*places(roots)}, {*places(data.demos or roots)}
+    cut = bool(data.held_out and here & shown and not (whole and here <= shown))
+    held = _held_out(config, data.demos or roots) if cut else {}
+    if not any(len(held.get(name, ())) for name in here):
+        source = open_configured(config, roots)
+        return split_tested(source, data.tested)[0] if data.tested else source
+    named = data_roots(roots)
+    parts = [open_configured(config, root.path) for root in named]
+    out = [held.get(place(root.path), np.zeros(0, np.int64)) for root in named]
+    if data.tested:
+        before = np.cumsum([0, *(part.recordings for part in parts)])
+        numbers = np.concatenate([some + start for some, start in zip(out, before, strict=False)])
+        kept = np.setdiff1d(tested_numbers(int(before[-1]), data.tested)[0], numbers)
+        how = f"tested {data.tested:g} without {' '.join(map(str, numbers))}"
+        return chosen_episodes(open_configured(config, roots), kept, how)
+    # The held-out ones of a set are its last: another number would be another set to a finished stage.
+    left = [
+        (episode_range(part, 0, part.recordings - len(some)) if len(some) else part, root.weight)
+        for part, root, some in zip(parts, named, out, strict=True)
+        if len(some) < part.recordings
+    ]
+    if not left:
+        raise DataError(f"data.root={roots}: got held-out demonstrations alone, expected others: lower data.held_out")
+    return weighted([part for part, _ in left], [weight for _, weight in left])
+
+
+def _held_out(config: ExperimentConfig, roots: str) -> dict[str, IntArray]:
+    """Numbers of the held-out episodes of each set of demonstrations, by its place; a DataError where all would be."""
+    paths, data = [root.path for root in data_roots(roots)], config.data
+    counts = [open_configured(config, path).recordings for path in paths]
+    total = sum(counts)
+    last: IntArray = np.arange(free_demonstrations(total, data.held_out), total)
+    if data.tested:  # the last of all, too: who measures may not know of the test
+        there = tested_numbers(total, data.tested)[0]
+        last = np.union1d(last, there[free_demonstrations(len(there), data.held_out) :])
+    ends = np.cumsum(counts)
+    pairs = zip(paths, ends - counts, ends, strict=True)
+    return {place(path): last[(last >= begin) & (last < end)] - begin for path, begin, end in pairs}
