@@ -119,5 +119,6 @@ def _packets(path: Path) -> list[tuple[float, str]]:
 
     with av.open(str(path)) as container:
         stream: Any = container.streams.video[0]
-        packets = (packet for packet in container.demux(stream) if packet.size)
-        return sorted((float((packet.pts or 0) * stream.time_base), _digest(bytes(packet))) for packet in packets)
+        packets = [packet for packet in container.demux(stream) if packet.size]
+        found = [(float((packet.pts or 0) * stream.time_base), _digest(bytes(packet))) for packet in packets]
+    return sorted(found)

@@ -35,7 +35,7 @@ def test_frames_actions_and_episodes_of_an_image_data_set(foreign_images: Path, 
     assert source.starts.tolist() == [0, 5, 8]
     assert source.actions is not None
     assert source.actions[5:8].tolist() == [[0, 0], [1, -1], [2, -2]]
-    assert (source.success, source.seeds) == (None, None)
+    assert source.seeds is None
     assert (source.fps, source.task, source.camera) == (10.0, "push", "observation.images.top")
     assert isinstance(source.frames, np.memmap)
     assert source.pixels([[0, 1]]).shape == (1, 2, 3, 32, 32)

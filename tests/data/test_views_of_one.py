@@ -75,8 +75,8 @@ def test_what_a_run_is_measured_on_was_in_no_view_trained_on(both: EpisodeFrames
     assert not {e for e, _ in views(both, last.tested.tolist())} & {e for e, _ in views(both, last.fitted.tolist())}
     split = split_demonstrations(both, 5, 2, 2, 0)
     policy = {"data": {"demos": split.trained.fingerprint}, "demos": 5, "held_out_demos": 2}
-    world = {"slots": {"held_out": 2}, "dynamics": {"held_out": 2}}
-    known = hold_out(both, {"policy": policy, **world}, DataConfig(), 100)
+    world = {name: {"held_out": 2, "trained_on": ["0"]} for name in ("slots", "dynamics")}
+    known = hold_out(replace(both, origins=both.numbers.astype(str)), {"policy": policy, **world}, DataConfig(), 100)
     assert (known.known, {e for e, _ in views(both, known.tested.tolist())}) == (True, {6, 7})
 
 

@@ -13,7 +13,7 @@ from playslot_rl.config import DataConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
-from playslot_rl.data.views import concatenate, episode_range, split_tested
+from playslot_rl.data.views import concatenate, episode_range, split_tested, views_of_one
 from playslot_rl.data.weighted import open_configured, weighted
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
@@ -116,6 +116,9 @@ def test_sets_without_weights_agree_in_frames_and_rate_and_the_rest_is_said(caps
         assert line.startswith(f"note: b: got {what}, expected ")
     assert (joined.camera, joined.actions) == ("top,side", None)
     concatenate([first, a_set(1, SMALL, name="b", robot="arm")])
+    for joined in (concatenate, lambda sets: weighted(sets, [1.0, 2.0]), views_of_one):
+        with pytest.raises(DataError, match=r"got the frames of .* twice, expected each recording once"):
+            joined([first, replace(first, name="a/")])
     assert capsys.readouterr().err == ""
 
 

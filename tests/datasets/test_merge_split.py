@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from damage import CAMERA, ROWS, add_episodes, edit_column, edit_json, frames_of, keep_rows, killed_while, load
 
+from playslot_rl.data.agreement import open_files
+from playslot_rl.data.prints import episode_origins
 from playslot_rl.datasets import merge as merging
 from playslot_rl.datasets.fingerprint import content_fingerprint
 from playslot_rl.datasets.merge import merge
@@ -242,3 +244,26 @@ def test_a_merge_killed_before_it_gets_its_name_leaves_the_sources_and_the_same_
     assert (result.verification.ok, result.verification.episodes, result.verification.frames) == (True, 6, 30)
     assert content_fingerprint(out).episodes == content_fingerprint(images).episodes * 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "all", "b"]
+
+
+@pytest.mark.parametrize("stored", ["images", "video"])
+def test_an_episode_without_actions_is_known_in_every_set_it_is_copied_to(
+    stored: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    root: Path = request.getfixturevalue(stored)
+    split(root, tmp_path / "parts", {"a": 0.4, "b": 0.6})
+    parts = [tmp_path / "parts" / name for name in "ba"]
+    merge(parts, tmp_path / "merged")
+
+    def origins(at: Path, actions: float | None = None) -> list[str]:
+        files = open_files(at)
+        said = None if actions is None else np.full((files.rows, 2), actions, np.float32)
+        found = episode_origins(files, said, tmp_path / "cache")
+        assert found is not None
+        return found.tolist()
+
+    known = origins(root)
+    assert len({*known}) == 3
+    assert origins(tmp_path / "merged") == [one for part in parts for one in origins(part)] != known
+    assert {*origins(tmp_path / "merged")} == {*known}
+    assert origins(root, np.nan) == origins(root, 0.5) == known

@@ -244,13 +244,22 @@ def test_the_world_models_own_videos_are_measured_where_its_validation_was(model
 
 
 def test_the_policys_demonstrations_are_measured_on_those_it_held_out() -> None:
-    source = videos()
+    source = replace(videos(), origins=np.arange(EPISODES).astype(str))
     trained = split_demonstrations(source, 8, 3, 3, 0).trained.fingerprint
     policy = {"data": {"demos": trained}, "demos": 8, "held_out_demos": 3, "seed": 0}
-    for held_out, known in ((3, True), (2, False)):
-        metas = {"policy": policy, "slots": {"held_out": held_out}, "dynamics": {"held_out": 3}}
-        found = hold_out(source, metas, DataConfig(), 100)
-        assert (found.tested.tolist(), found.known) == ([9, 10, 11], known)
+    for held_out, seen, tested, known in (
+        (3, ["0"], [9, 10, 11], True),
+        (2, ["0"], [9, 10, 11], False),
+        (3, None, [9, 10, 11], False),
+        (3, ["0", "10"], [9, 11], True),
+        (3, ["9", "10", "11"], [9, 10, 11], False),
+    ):
+        world = {"slots": {"held_out": held_out, "trained_on": seen}, "dynamics": {"held_out": 3, "trained_on": ["1"]}}
+        found = hold_out(source, {"policy": policy, **world}, DataConfig(), 100)
+        assert (found.tested.tolist(), found.known) == (tested, known)
+    first, *rest = split_episodes(EPISODES, 0.5, 4)[1].tolist()
+    own = {"dynamics": {"data": {"train": "print"}, "seed": 4, "trained_on": [str(first)]}}
+    assert hold_out(source, own, DataConfig(validation=0.5), 100).tested.tolist() == rest, "a copy was trained on"
     assert hold_out(source, {"policy": policy | {"demos": 7}}, DataConfig(), 100).known is False
     named = hold_out(source, {}, DataConfig(held_out=2), 100)
     assert (named.tested.tolist(), named.known) == ([10, 11], False)

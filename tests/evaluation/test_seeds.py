@@ -6,6 +6,8 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from playslot_rl.config import DataConfig, EvaluationConfig, ExperimentConfig
@@ -27,15 +29,24 @@ def test_seed_blocks_do_not_meet() -> None:
     assert first_seed(config, 4242) == episode_seed("evaluation", 4242, 0)
 
 
-def test_seeds_are_read_from_lists_and_from_episode_records(tmp_path: Path) -> None:
-    assert recorded_seeds(_data_set(tmp_path / "a", {"spec": {"seed": 99}, "seeds": [1, 2]})) == {1, 2}
-    assert recorded_seeds(_data_set(tmp_path / "b", {"episodes": [{"seed": 5}, {"seed": 6}]})) == {5, 6}
+def _with_seeds(root: Path, *seeds: int) -> Path:
+    return _data_set(root, {"spec": {"seed": 99}, "episodes": [{"seed": seed} for seed in seeds]})
+
+
+def test_seeds_are_read_from_records_and_from_rows(tmp_path: Path) -> None:
+    assert recorded_seeds(_with_seeds(tmp_path / "a", 5, 6)) == {5, 6}
     assert recorded_seeds(tmp_path / "none") == set()
+    (tmp_path / "rows" / "data" / "chunk-000").mkdir(parents=True)
+    for name, column in (("0", "seed"), ("1", "other")):
+        pq.write_table(pa.table({column: [7, 7, 8]}), tmp_path / "rows" / "data" / "chunk-000" / f"{name}.parquet")
+    assert recorded_seeds(tmp_path / "rows") == {7, 8}
 
 
-def test_seeds_of_all_named_data_sets_and_of_the_run_are_known(tmp_path: Path) -> None:
-    _data_set(tmp_path / "run" / "data" / "expert", {"seeds": [3]})
-    roots = f"{_data_set(tmp_path / 'a', {'seeds': [1]})}, {_data_set(tmp_path / 'b', {'seeds': [2]})}"
+def test_seeds_of_all_named_data_sets_and_of_the_run_are_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    _with_seeds(tmp_path / "run" / "data" / "expert", 3)
+    _with_seeds(tmp_path / "b", 2)
+    roots = f"{_with_seeds(tmp_path / 'a', 1)}, ~/b"
     config = replace(ExperimentConfig(), data=DataConfig(root=roots))
     assert training_seeds(config, tmp_path / "run") == {1, 2, 3}
 

@@ -10,8 +10,11 @@ from typing import Any, cast
 import pytest
 from clips import moving_square
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.config.methods import METHODS
+from playslot_rl.errors import CheckpointError
+from playslot_rl.methods.playslot.method import SLOTS
+from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
 STRIDE = "got 5 frames a second, expected 10 as the run's model was shown: record at that rate, or choose data.stride="
@@ -39,3 +42,31 @@ def test_another_rate_or_camera_is_one_line(
     said = capsys.readouterr().err.splitlines()
     for line, start in zip(said, expected, strict=True):
         assert line.startswith(f"note: {name}: {start}")
+
+
+@pytest.mark.parametrize(
+    ("camera", "stored", "skipped"),
+    [
+        ("front", "front", True),
+        ("front", None, True),
+        ("front,side", "front", True),  # versions before named the first
+        ("side", "front", False),
+        ("side,front", "front,side", False),
+    ],
+)
+def test_a_stage_is_finished_with_the_camera_that_it_was_shown(
+    camera: str, stored: str | None, skipped: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = replace(moving_square(), camera=camera)
+    done = SimpleNamespace(meta={"data": {"train": source.fingerprint}, "steps": 1, "camera": stored})
+    (tmp_path / "slots" / "checkpoint").mkdir(parents=True)
+    (tmp_path / "slots" / "checkpoint" / "meta.json").touch()
+    for name, value in (("read_stage", done), ("require_parents", None), ("require_config", None)):
+        monkeypatch.setattr(records, name, lambda *_, value=value: value)
+    record = StageRecord(SLOTS, tmp_path, ExperimentConfig(data=DataConfig(root="videos")))
+    vars(record)["videos"] = source
+    if skipped:
+        assert record.finished() is cast("Any", done)
+    else:
+        with pytest.raises(CheckpointError, match=f"data.camera: got {camera}, expected front"):
+            record.finished()
