@@ -184,9 +184,13 @@ def recorded_seeds(root: Path) -> set[int]:
 
 
 def data_folders(config: ExperimentConfig, run: Path | None = None) -> list[Path]:
-    """Data sets the config names, then what is in the run's `data` folder."""
+    """Data sets the config names, then what is in the run's `data` folder, each once."""
     named = [Path(root.path).expanduser() for root in data_roots(f"{config.data.root},{config.data.demos}")]
-    return [*named, *(sorted((run / "data").glob("*")) if run is not None else [])]
+    named += sorted((run / "data").glob("*")) if run is not None else []
+    once: dict[Path, Path] = {}
+    for path in named:
+        once.setdefault(path.resolve(), path)
+    return [*once.values()]
 
 
 def training_seeds(config: ExperimentConfig, run: Path | None = None) -> set[int]:

@@ -65,7 +65,7 @@ def latent_section(given: ReportInput) -> Section:
         return Section(title, [Missing("The run names no data set on this machine.", COLLECT)])
     model = given.world_model
     sets, blocks = [], list[Block]()
-    for root in {p.resolve(): p for p in found}.values():
+    for root in found:
         try:
             sets.append(read_latents(model, root, given))
         except DataError as error:  # the rest of the report does not depend on it

@@ -119,7 +119,7 @@ def test_a_test_keeps_whole_episodes_and_sets_side_by_side_stay_apart(both: Epis
 
 
 def test_the_rest_of_sets_with_weights_knows_whose_its_rows_are(both: EpisodeFrames) -> None:
-    other = replace(views_of_one([seen_by(1, 8), seen_by(2, 8)]), name="other")
+    other = replace(views_of_one([seen_by(1, 8), seen_by(2, 8)]), name="other", fingerprint="other")
     joined = weighted([both, other], [1.0, 2.0])
     rest = split_demonstrations(joined, None, 9, 0).held_out
     assert rest is not None

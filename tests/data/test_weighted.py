@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,8 +144,9 @@ def test_some_of_the_episodes_keep_their_weights(two: EpisodeFrames) -> None:
 def test_a_config_names_weights_and_a_plain_text_is_as_before(foreign_images: Path, tmp_path: Path) -> None:
     config = replace(tiny_config(), data=DataConfig(cache=str(tmp_path)))
     config = replace(config, env=replace(config.env, image_size=32))
-    other = tmp_path / "other"
-    other.symlink_to(foreign_images)
+    other = Path(shutil.copytree(foreign_images, tmp_path / "other"))
+    with (other / "meta" / "info.json").open("a") as info:
+        info.write("\n")  # one set twice would be refused
     both = open_configured(config, f"{foreign_images}:3,{other}")
     assert both.shares is not None
     assert both.shares.weights.tolist() == [3.0, 1.0]
@@ -155,7 +157,9 @@ def test_a_config_names_weights_and_a_plain_text_is_as_before(foreign_images: Pa
         open_configured(config, str(foreign_images)).fingerprint
         == open_sources(foreign_images, cache=tmp_path).fingerprint
     )
-    assert len([entry for entry in (tmp_path / "frames").iterdir() if entry.is_dir()]) == 1  # one content, one cache
+    (tmp_path / "link").symlink_to(foreign_images)
+    assert len(open_sources(tmp_path / "link", cache=tmp_path).frames) == 15
+    assert len([entry for entry in (tmp_path / "frames").iterdir() if entry.is_dir()]) == 2  # one content, one cache
 
 
 def test_slots_are_parsed_once_for_each_set_whatever_the_weights(
