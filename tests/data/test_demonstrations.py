@@ -72,7 +72,7 @@ def test_actions_are_clamped_and_of_the_right_width(source: EpisodeFrames) -> No
 def test_sets_with_and_without_actions_are_one_whose_first_demonstrations_are_labelled(source: EpisodeFrames) -> None:
     low, high = np.float32([-1, 0]), np.float32([9, 10])
     acted = replace(source, name="acted", limits=ActionLimits(("x", "y"), low, high, low, high))
-    silent = replace(source, name="silent", actions=None)
+    silent = replace(source, name="silent", fingerprint="silent", actions=None)
     both = concatenate([acted, silent])
     assert both.actions is not None
     assert both.limits is not None
@@ -92,7 +92,8 @@ def test_sets_with_and_without_actions_are_one_whose_first_demonstrations_are_la
         with pytest.raises(DataError, match=r"^silent: got no actions, expected some .*: 2 have any"):
             require_finite(given, wanted)
     assert concatenate([silent, replace(silent, fingerprint="other")]).actions is None
-    assert concatenate([acted, replace(acted, actions=np.zeros((6, 3), np.float32))]).actions is None
+    wide = replace(acted, fingerprint="wide", actions=np.zeros((6, 3), np.float32))
+    assert concatenate([acted, wide]).actions is None
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,10 @@ def test_the_data_set_is_left_untouched(foreign_images: Path, tmp_path: Path) ->
 
 
 def test_several_data_sets_are_read_as_one(foreign_images: Path, damaged: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"got the frames of .* twice"):
+        open_sources(f"{foreign_images}, {damaged}", cache=tmp_path / "cache")
+    with (damaged / "meta" / "info.json").open("a") as info:
+        info.write("\n")
     both = open_sources(f"{foreign_images}, {damaged}", cache=tmp_path / "cache")
     frames = np.concatenate(foreign_frames())
     assert isinstance(both.frames, RowView)
