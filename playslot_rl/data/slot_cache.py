@@ -32,7 +32,8 @@ SlotRows = npt.NDArray[np.float32]
 
 _FORMAT = "1"
 _BY_ROW = "2"  # where episodes are left out between others: slots stand at their frames' rows, too
-EPISODES_A_BATCH = 32
+_DRAWN = "by 32"  # initial slots that are drawn: once a stream's were drawn for as many episodes as its buffer held
+EPISODES_A_BATCH = 32  # at most; initial slots are drawn for so many, however many are parsed together
 MARK_EVERY = 16  # batches after which a build says how far it is
 BEGUN = "begun.json"  # how many episodes are parsed, in an entry that is being made
 FRAMES_A_PASS = 4  # frames of each episode parsed at a time: bounds the memory of the encoder's activations
@@ -69,6 +70,7 @@ def slot_cache(
     # Of some chosen episodes those between are left out.
     whole = np.array_equal(source.starts, np.cumsum(source.lengths) - source.lengths)
     identity = [_FORMAT if whole else _BY_ROW, source.fingerprint, source.camera, source.image_size, savi_fingerprint]
+    identity += [_DRAWN] if savi.config.initial == "gaussian" else []
     key = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:24]
     folder = cache_folder(cache) / "slots" / key
     count = int((source.starts + source.lengths).max())
@@ -99,12 +101,12 @@ def slot_cache(
 
 
 def _batches(source: EpisodeFrames, first: int = 0) -> Iterator[npt.NDArray[np.int64]]:
-    """Numbers of the episodes that are parsed together, from one on that begins a batch; of frames that are streamed as
-    many as a quarter of the buffer holds, which may be fewer."""
+    """Numbers of the episodes that are parsed together, from one on that begins a batch: 32 from a multiple of 32 on;
+    of frames that are streamed as many of them as a quarter of the buffer holds, which may be fewer."""
     lengths, streams = source.lengths, streams_of(source.frames)
     most = streams[0].buffer // 4 if streams else None
     while first < len(lengths):
-        last = min(first + EPISODES_A_BATCH, len(lengths))
+        last = min(first - first % EPISODES_A_BATCH + EPISODES_A_BATCH, len(lengths))
         if most is not None:
             last = max(first + 1, first + int(np.searchsorted(np.cumsum(lengths[first:last]), most, side="right")))
         yield np.arange(first, last)
@@ -129,11 +131,13 @@ def _parse(
     # Shorter episodes repeat their last frame; SAVi is causal, so what is kept does not see it.
     steps = np.minimum(np.arange(int(lengths.max())), lengths[:, None] - 1)
     rows = source.starts[episodes][:, None] + steps
-    generator = step_generator(0, int(episodes[0]), "slot_cache", device)
+    group = int(episodes[0]) // EPISODES_A_BATCH * EPISODES_A_BATCH
+    drawn = min(EPISODES_A_BATCH, source.episodes - group)
+    initial = savi.initializer(drawn, step_generator(0, group, "slot_cache", device))[episodes - group]
     pieces, state = [], None
     for begin in range(0, rows.shape[1], FRAMES_A_PASS):
         frames = normalise(source.pixels(rows[:, begin : begin + FRAMES_A_PASS]).to(device))
-        slots, state = savi(frames, state, generator)
+        slots, state = savi(frames, state, initial=initial)
         pieces.append(slots.float().cpu().numpy())
     parsed = np.concatenate(pieces, axis=1)
     return [parsed[i, :length] for i, length in enumerate(lengths)]

@@ -93,11 +93,12 @@ def test_what_has_made_way_takes_no_memory(foreign_images: Path, tmp_path: Path)
     assert all(part.base is None for part in kept), "no view of frames that were decoded beside it"
 
 
+@pytest.mark.parametrize("initial", ["learned", "gaussian"])
 @pytest.mark.parametrize(("buffer", "together"), [(1, [[0], [1], [2]]), (44, [[0, 1], [2]]), (1000, [[0, 1, 2]])])
 def test_slots_of_streamed_episodes_are_parsed_in_as_many_as_are_kept(
-    foreign_images: Path, tmp_path: Path, buffer: int, together: list[list[int]], decoded: list[list[int]]
+    foreign_images: Path, tmp_path: Path, initial: str, buffer: int, together: list[list[int]], decoded: list[list[int]]
 ) -> None:
-    savi = tiny_savi(initial="learned")
+    savi = tiny_savi(initial=initial)
     want = list(parse_episodes(open_sources(foreign_images, cache=tmp_path), savi))
     found = list(parse_episodes(open_sources(foreign_images, cache=tmp_path, buffer=buffer), savi))
     for one, other in zip(want, found, strict=True):

@@ -69,7 +69,11 @@ class SAVi(nn.Module):
             self.transition.start_as_identity()
 
     def forward(
-        self, frames: Tensor, state: Tensor | None = None, generator: torch.Generator | None = None
+        self,
+        frames: Tensor,
+        state: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        initial: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Parse a clip.
 
@@ -77,6 +81,7 @@ class SAVi(nn.Module):
             frames: (B, T, 3, H, W) float in [0, 1].
             state: (B, N, D) returned by the previous call of the same episode; None at its first frame.
             generator: draws the initial slots of the `gaussian` initialiser.
+            initial: slots (B, N, D) to begin the first frame with, where they are drawn already.
 
         Returns:
             Slots (B, T, N, D), and the state to go on from.
@@ -86,7 +91,8 @@ class SAVi(nn.Module):
             x.unflatten(0, (b, t)).unbind(1) for x in self.features(frames.flatten(0, 1), self._bf16(frames))
         )
         first = state is None
-        current = self.initializer(b, generator) if state is None else state
+        current = state if state is not None else initial
+        current = self.initializer(b, generator) if current is None else current
         slots = []
         for i in range(t):
             iterations = self.config.first_iterations if first and i == 0 else self.config.iterations
