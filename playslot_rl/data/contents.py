@@ -20,7 +20,7 @@ import numpy as np
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.weights import data_roots
-from playslot_rl.data.metadata import CAMERAS, DATA_PATH, INFO_NAME, VIDEO_PATH, read_info
+from playslot_rl.data.metadata import CAMERAS, DATA_PATH, INFO_NAME, VIDEO_PATH, is_depth, read_info
 from playslot_rl.data.places import Problems, filled, inside, note_odd_files, parquet_files
 from playslot_rl.data.tables import Array, Episode, episodes_of, holds_numbers, read_columns, read_table, read_tasks
 from playslot_rl.errors import DataError
@@ -116,13 +116,17 @@ class Contents:
 
     def camera(self, wanted: str) -> str:
         """The camera to read, by its full name: the wanted one, or the only one. A DataError where there is none, or
-        several and none was named."""
-        names = ", ".join(self.cameras) or "none"
-        if not wanted and len(self.cameras) == 1:
-            return self.cameras[0]
+        several and none was named, or the wanted one is a depth map, whose 16 bits no picture of 8 has room for."""
+        seen = [name for name in self.cameras if not is_depth(self.features[name])]
+        names = ", ".join(seen) or "none"
+        if not wanted and len(seen) == 1:
+            return seen[0]
         if not wanted:
-            raise DataError(f"{self.name}: got {len(self.cameras)} cameras ({names}), expected one: set data.camera=")
-        return full_name(wanted, self.cameras, self.name)
+            raise DataError(f"{self.name}: got {len(seen)} cameras ({names}), expected one: set data.camera=")
+        name = full_name(wanted, self.cameras, self.name)
+        if name not in seen:
+            raise DataError(f"data.camera={wanted}: got a depth map, expected one of {self.name}'s {names}")
+        return name
 
     @cached_property
     def spans(self) -> list[Span]:
@@ -139,6 +143,11 @@ class Contents:
     def video_file(self, camera: str, row: dict[str, Any]) -> Path | None:
         """File with an episode's video, or None where its row names none."""
         return self._file(f"videos/{camera}", self.info.get("video_path") or VIDEO_PATH, row, camera)
+
+    def named_videos(self, camera: str) -> set[Path]:
+        """The files with a camera's videos, wherever `video_path` puts them, as far as they are there."""
+        named = {self.video_file(camera, episode.row) for episode in self.episodes}
+        return {path for path in named if path is not None and self.holds(path)}
 
     def video_times(self, camera: str, row: dict[str, Any]) -> tuple[float, float] | None:
         """From where to where an episode lies in its video, seconds, or None where its row says no such thing."""
@@ -159,7 +168,7 @@ class Contents:
         """Hash of the metadata, the rows and the camera's videos as they are stored: 16 hex digits."""
         digest = hashlib.sha256()
         paths = [self.root / INFO_NAME, *parquet_files(self.root, "meta/episodes"), *parquet_files(self.root, "data")]
-        paths += sorted((self.root / "videos" / camera).rglob("*.mp4"))
+        paths += sorted({*(self.root / "videos" / camera).rglob("*.mp4"), *self.named_videos(camera)})
         for path in paths:
             digest.update(str(path.relative_to(self.root)).encode())
             with path.open("rb") as file:

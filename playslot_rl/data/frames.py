@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.metadata import INFO_NAME, LARGEST_PICTURE, stated_size
-from playslot_rl.data.places import Problems, inside, is_plain_path
+from playslot_rl.data.places import Problems
 from playslot_rl.data.tables import WRONG_COLUMN, Array
 from playslot_rl.errors import DataError, first_line
 
@@ -98,7 +98,7 @@ def _image_frames(
     wanted = np.zeros(contents.rows, bool)
     for span in spans:
         wanted[span.start : span.stop] = True
-    decode = functools.partial(_decode_image, contents.root, stated_size(contents.features[camera]))
+    decode = functools.partial(_decode_image, stated_size(contents.features[camera]))
     row = 0
     # Decoding PNG releases the interpreter lock; two threads suffice to keep one core busy with it.
     with ThreadPoolExecutor(2) as pool:
@@ -124,8 +124,7 @@ def _stored_images(
 
     with pq.ParquetFile(contents.opened(path)) as file:
         column = file.schema_arrow.field(camera).type if file.schema_arrow.names.count(camera) == 1 else None
-        # As LeRobot stores images: bytes, or the path of a file.
-        if column is None or not {"bytes", "path"} & {column.field(i).name for i in range(column.num_fields)}:
+        if column is None or "bytes" not in {column.field(i).name for i in range(column.num_fields)}:
             problems.error(WRONG_COLUMN, f"{path}: got no column {camera} of images, expected the camera's frames")
             return
         counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
@@ -141,7 +140,7 @@ def _stored_images(
                 first += len(batch)
 
 
-def _decode_image(root: Path, size: tuple[int, int], cell: dict[str, Any] | None) -> Array | str:
+def _decode_image(size: tuple[int, int], cell: dict[str, Any] | None) -> Array | str:
     """Pixels of a stored image, (H, W, 3) uint8 for colours, or what is wrong with it: its header is read first, and
     nothing is decoded that has another size (H, W) than stated."""
     from PIL import Image, UnidentifiedImageError
@@ -150,7 +149,9 @@ def _decode_image(root: Path, size: tuple[int, int], cell: dict[str, Any] | None
     try:
         if cell is None:
             return f"cannot be decoded (no image), {expected}"
-        with Image.open(io.BytesIO(_stored_bytes(root, cell)), formats=FORMATS) as image:
+        if not cell["bytes"]:  # a picture exchanged in place would leave the caches as they are
+            return "got no more than a file's name, expected the picture itself among the rows of the data set"
+        with Image.open(io.BytesIO(cell["bytes"]), formats=FORMATS) as image:
             got = (image.height, image.width)
             if got != size:
                 return f"got {got}, expected {size} as stated"
@@ -162,16 +163,6 @@ def _decode_image(root: Path, size: tuple[int, int], cell: dict[str, Any] | None
         return f"got a picture of more than {Image.MAX_IMAGE_PIXELS} pixels, expected {size} as stated"
     except (OSError, ValueError, SyntaxError, KeyError, TypeError, AttributeError, EOFError, struct.error) as error:
         return f"cannot be decoded ({' '.join(str(error).split())[:80] or type(error).__name__}), {expected}"
-
-
-def _stored_bytes(root: Path, cell: dict[str, Any]) -> bytes:
-    """Of an image in a cell, or of the file below the data set's folder that it names."""
-    if cell.get("bytes"):
-        return bytes(cell["bytes"])
-    path: Path = root / cell["path"]
-    if not is_plain_path(cell["path"]) or not inside(root, path):
-        raise ValueError("it names a file that is not of the data set")
-    return path.read_bytes()
 
 
 def _video_frames(

@@ -37,7 +37,7 @@ def of_pictures(origin: str) -> bool:
 def files_fingerprint(files: Contents, camera: str, cache: Path) -> str:
     """Content hash of a data set."""
     if files.remote is not None:
-        return files.remote.fingerprint(camera)
+        return files.remote.fingerprint(camera, files.named_videos(camera))
     return str(_noted(files, camera, cache, lambda: files.file_hash(camera)))
 
 
@@ -60,10 +60,10 @@ def episode_origins(files: Contents, actions: Array | None, cache: Path) -> npt.
 
 def _noted(files: Contents, what: str, cache: Path, make: Callable[[], Any]) -> Any:
     """What is made of a data set, remembered by the names, sizes and times of its files: reading videos is slow."""
+    paths = {path for folder in ("meta", "data", "videos") for path in (files.root / folder).rglob("*")}
     listing = sorted(
         (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
-        for folder in ("meta", "data", "videos")
-        for path in (files.root / folder).rglob("*")
+        for path in paths.union(*map(files.named_videos, files.videos))
         if path.is_file()
     )
     key = hashlib.sha256(json.dumps([str(files.root.resolve()), what, listing]).encode()).hexdigest()[:32]

@@ -14,7 +14,7 @@ import io
 import json
 import re
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -74,11 +74,12 @@ class Remote:
     def holds(self, path: Path) -> bool:
         return path.relative_to(self.root).as_posix() in self.hashes
 
-    def fingerprint(self, camera: str) -> str:
-        """Hash of the names and hashes of what `Contents.file_hash` reads: 16 hex digits. It is another one."""
-        videos = f"videos/{camera}/"
-        told = (INFO_NAME, "meta/episodes/", "data/", videos)
-        wanted = sorted((path, value) for path, value in self.hashes.items() if path.startswith(told))
+    def fingerprint(self, camera: str, videos: Collection[Path]) -> str:
+        """Hash of the names and hashes of what `Contents.file_hash` reads, `videos` of the camera wherever they lie: 16
+        hex digits. It is another one."""
+        told = (INFO_NAME, "meta/episodes/", "data/", f"videos/{camera}/")
+        named = {path.relative_to(self.root).as_posix() for path in videos}
+        wanted = sorted((p, value) for p, value in self.hashes.items() if p.startswith(told) or p in named)
         return hashlib.sha256(json.dumps(wanted).encode()).hexdigest()[:16]
 
 

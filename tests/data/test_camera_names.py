@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,16 @@ def test_what_is_ambiguous_or_unknown_is_refused_with_the_list(typed: str, messa
     with pytest.raises(DataError, match=message) as refused:
         full_name(typed, CAMERAS, "set")
     assert "\n" not in str(refused.value)
+
+
+def test_a_depth_map_is_no_camera_to_learn_from(two: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(two, tmp_path / "set"))
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"][SIDE]["info"] = {"is_depth_map": True}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match=rf"data\.camera=side: got a depth map, .* {TOP}$"):
+        open_source(root, "side", tmp_path / "cache")
+    assert open_source(root, "", tmp_path / "cache").camera == TOP  # the only one of colours
 
 
 def test_all_readers_take_the_short_name_for_the_same_frames(two: Path, tmp_path: Path) -> None:

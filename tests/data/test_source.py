@@ -84,6 +84,23 @@ def test_the_fingerprint_follows_the_content_not_the_place(foreign_images: Path,
     assert open_sources(other, cache=tmp_path / "cache").fingerprint != one.fingerprint
 
 
+def test_the_fingerprint_follows_videos_wherever_their_template_puts_them(foreign_video: Path, tmp_path: Path) -> None:
+    top, side = (f"observation.images.{name}" for name in ("top", "side"))
+    root = Path(shutil.copytree(foreign_video, tmp_path / "set"))
+    info = root / "meta" / "info.json"
+    elsewhere = {"video_path": "clips/chunk-{chunk_index:03d}/{video_key}/file-{file_index:03d}.mp4"}
+    info.write_text(json.dumps(json.loads(info.read_text()) | elsewhere))
+    for camera in (top, side):
+        (root / "clips" / "chunk-000").mkdir(parents=True, exist_ok=True)
+        shutil.move(root / "videos" / camera / "chunk-000", root / "clips" / "chunk-000" / camera)
+    before = [open_source(root, camera, tmp_path, buffer=9).fingerprint for camera in (top, side)]
+    with next((root / "clips" / "chunk-000" / top).iterdir()).open("ab") as file:
+        file.write(bytes(64))
+    after = [open_source(root, camera, tmp_path, buffer=9).fingerprint for camera in (top, side)]
+    assert after[0] != before[0]
+    assert after[1] == before[1]
+
+
 def test_the_data_set_is_left_untouched(foreign_images: Path, tmp_path: Path) -> None:
     before = sorted((str(path), path.stat().st_mtime_ns) for path in foreign_images.rglob("*"))
     open_sources(foreign_images, cache=tmp_path)
@@ -145,11 +162,11 @@ def another_file_of_rows(root: Path) -> None:
     shutil.copy(path, path.with_name("file-001.parquet"))
 
 
-def frame_that_is_none(root: Path) -> None:
+def frame_that_is_none(root: Path, content: bytes | None = b"no picture") -> None:
     path = next((root / "data").rglob("*.parquet"))
     table = pq.read_table(path)
     rows = table.to_pylist()
-    rows[7]["observation.images.top"]["bytes"] = b"no picture"
+    rows[7]["observation.images.top"]["bytes"] = content
     pq.write_table(type(table).from_pylist(rows, schema=table.schema), path)
 
 
@@ -179,6 +196,7 @@ FAULTS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "half its episodes": ("images", partial(cut, folder="meta/episodes"), "never finalised, or is truncated"),
     "rows of nobody": ("images", another_file_of_rows, "got 30 rows and 3 episodes of 15 frames, expected 15"),
     "no picture": ("images", frame_that_is_none, r"a frame of observation\.images\.top cannot be decoded"),
+    "a picture's name": ("images", partial(frame_that_is_none, content=None), "row 7, .*: got no more than"),
     "half a video": ("video", cut_videos, r"cannot decode the frame at 0\.000 s"),
     "a video too short": ("video", later_episode, r"at 3\.000 s \(it ends too early\)"),
 }
