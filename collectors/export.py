@@ -19,12 +19,12 @@ from playslot_rl import keys
 from playslot_rl.collectors.image_set import ImageSetWriter, feature, finalising, new_set
 from playslot_rl.collectors.journal import CollectionSpec, Journal, RecordedEpisode
 from playslot_rl.config.env import in_turn
-from playslot_rl.data.metadata import RECORD_NAME
+from playslot_rl.data.metadata import RECORD_NAME, STATS_NAME
 from playslot_rl.envs import PROCEDURAL, task_metadata
 from playslot_rl.envs.grid_shapes import METADATA
 from playslot_rl.errors import OutputError
 from playslot_rl.runtime.progress import quiet_datasets
-from playslot_rl.storage.atomic import write_json
+from playslot_rl.storage.atomic import read_json, write_json
 from playslot_rl.storage.folders import new_folder
 
 PACKAGES = ("metaworld", "gymnasium-robotics", "mujoco", "gymnasium", "torchrl", "lerobot", "playslot_rl")
@@ -89,6 +89,8 @@ def _write(root: Path, spec: CollectionSpec, journal: Journal) -> list[dict[str,
             steps = int(episode.success.argmax()) + 1 if solved else None
             outcome = {"seed": episode.seed, "success": solved, "steps_to_success": steps, "redrawn": episode.redrawn}
             records.append(outcome)
+    stats = read_json(root / STATS_NAME)  # LeRobot puts features in an order that changes from one process to the next
+    write_json(root / STATS_NAME, {name: stats[name] for name in dataset.meta.features if name in stats})
     return records
 
 

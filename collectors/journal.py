@@ -223,15 +223,11 @@ class Journal:
             with np.load(path, allow_pickle=False) as file:
                 there, seed, redrawn = (int(n) for n in file["numbers"])
                 arrays = {name: file[name] for name in ARRAYS}
-                if "frames" in file.files:  # written by version 0.1
-                    frames = file["frames"]
-                    images = [png(frame) for frame in frames]
-                else:
-                    ends = np.cumsum(file["image_sizes"]).tolist()
-                    content = file["images"].tobytes()
-                    images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
-                    read = [np.asarray(Image.open(io.BytesIO(image))) for image in images] if decode else []
-                    frames = np.stack(read) if decode else np.zeros(0, np.uint8)
+                ends = np.cumsum(file["image_sizes"]).tolist()
+                content = file["images"].tobytes()
+                images = [content[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+                read = [np.asarray(Image.open(io.BytesIO(image))) for image in images] if decode else []
+                frames = np.stack(read) if decode else np.zeros(0, np.uint8)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise OutputError(
                 f"{path}: got a damaged file ({error}), expected an episode; delete it and run the same command again"

@@ -1,9 +1,9 @@
 """The range of a data set's actions, from its own statistics.
 
 LeRobot's `meta/stats.json` gives the smallest and the largest of each dimension. Where it says nothing that can be used
-(missing, NaN, another shape, narrower than the data) they are computed from the finite values of the data. Quantiles
-always are: LeRobot's are means over episodes, which one reading that is none carries off. Our simulators' actions are
-in [-1, 1] by definition: their sets have no range of their own.
+(missing, NaN, another shape, narrower or far wider than the data) they are computed from the finite values of the data.
+Quantiles always are: LeRobot's are means over episodes, which one reading that is none carries off. Our simulators'
+actions are in [-1, 1] by definition: their sets have no range of their own.
 
 Shapes: F rows, A action width.
 """
@@ -19,13 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl import keys
-from playslot_rl.data.metadata import STATS_NAME, json_content
+from playslot_rl.data.agreement import say_once
+from playslot_rl.data.metadata import RECORD_NAME, STATS_NAME, json_content
 
 if TYPE_CHECKING:
     from playslot_rl.data.contents import Contents
     from playslot_rl.modules.action_range import ActionRange
 
-WIDE: Final = 3.0  # smallest to largest is so many times as wide as q01 to q99 where there may be outliers
+WIDE: Final = 3.0
+"""Smallest to largest is so many times as wide as q01 to q99 where there may be outliers, and what is stated so many
+times as wide as the data where it is not believed."""
 FEW: Final = 0.001
 """Share of the rows up to which values far outside q01 to q99 are outliers; more are a motion, such as a gripper's."""
 HUGE: Final = 1e30  # numbers that no robot knows: with them float32 would overflow
@@ -92,20 +95,32 @@ def scaled(plain: dict[str, Any] | None) -> bool:
 
 def limits_of(files: Contents, actions: Floats | None) -> ActionLimits | None:
     """The range of a data set's actions (F, A); None without any, and for sets of our own simulators."""
-    from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL  # with Gymnasium
-
-    if actions is None or str(files.info.get("robot_type") or "") in (*ENVIRONMENTS, *PROCEDURAL):
+    if actions is None or _simulated(files, actions):
         return None
     values = np.where(np.abs(actions) < HUGE, actions, np.nan)
     names, stated = _names(files.features[keys.FEATURE_ACTION], values.shape[1]), _stated(files, values.shape[1])
     first, last, smallest, largest = _ends(values, 0.01)
     if stated is not None and (stated[0] <= smallest).all() and (stated[1] >= largest).all():
-        smallest, largest = stated
+        wide = stated[1] - stated[0] > WIDE * (largest - smallest)
+        if wide.any():
+            say_once(
+                f"note: {files.name}: {STATS_NAME} says more than {WIDE:g} times the range that the actions "
+                f"{', '.join(np.array(names)[wide])} have: their own is taken"
+            )
+        smallest, largest = (np.where(wide, own, far) for own, far in zip((smallest, largest), stated, strict=True))
     span = last - first
     far = ((values < first - span) | (values > last + span)).sum(axis=0)
     outlying = (largest - smallest > WIDE * span) & (far > 0) & (far <= max(2, FEW * len(values)))
     low, high = np.where(outlying, first, smallest), np.where(outlying, last, largest)
     return ActionLimits(names, low, high, smallest, largest)
+
+
+def _simulated(files: Contents, actions: Floats) -> bool:
+    """Whether a set is of our own simulators: it is named as they are, and has our record or no value beyond 1."""
+    from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL  # with Gymnasium
+
+    named = str(files.info.get("robot_type") or "") in (*ENVIRONMENTS, *PROCEDURAL)
+    return named and ((files.root / RECORD_NAME).is_file() or not (np.abs(actions) > 1).any())
 
 
 def joined_limits(parts: Sequence[ActionLimits | None], width: int) -> ActionLimits | None:

@@ -18,7 +18,7 @@ from playslot_rl.config.weights import is_remote
 from playslot_rl.data.contents import Contents, Span, read_contents
 from playslot_rl.data.metadata import EPISODES_PATH, INFO_NAME, NUMBERS, OTHERS, clips_hint
 from playslot_rl.data.places import CLUTTER, OUTSIDE, SHOWN, Problems, filled, is_clutter, parquet_files
-from playslot_rl.data.tables import TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
+from playslot_rl.data.tables import MISSING, TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
 from playslot_rl.errors import DataError
 from playslot_rl.runtime.processes import here
 
@@ -269,7 +269,7 @@ def _require_order(contents: Contents, problems: Problems) -> None:
             f"note: {contents.root}: {problems.errors[0].replace(f'{contents.root}/', '')}{more}; stage 1 does not "
             "need that and trains, LeRobot's reader may fail: run `playslot dataset verify`, then `repair`"
         )
-    for line in problems.warnings_of(CLUTTER)[:SHOWN]:
+    for line in [*problems.warnings_of(CLUTTER)[:SHOWN], *problems.warnings_of(MISSING)[:SHOWN]]:
         say_once(f"note: {line}")
 
 

@@ -118,7 +118,7 @@ class Contents:
         """The camera to read, by its full name: the wanted one, or the only one. A DataError where there is none, or
         several and none was named, or the wanted one is a depth map, whose 16 bits no picture of 8 has room for."""
         seen = [name for name in self.cameras if not is_depth(self.features[name])]
-        names = ", ".join(seen) or "none"
+        names = ", ".join(seen) or "none of colours"
         if not wanted and len(seen) == 1:
             return seen[0]
         if not wanted:

@@ -38,6 +38,10 @@ class Problems:
         """Untidy, but every frame and number can be trusted."""
         self._warnings.setdefault(kind, []).append(message)
 
+    def excuse(self, kind: str) -> None:
+        """Make warnings of all errors of a kind."""
+        self._warnings.setdefault(kind, []).extend(self._errors.pop(kind, []))
+
     def of(self, kind: str) -> list[str]:
         return self._errors.get(kind, [])
 

@@ -22,11 +22,12 @@ from typing import Any, Final
 import numpy as np
 
 from playslot_rl import keys
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import build_once
 from playslot_rl.data.contents import Contents, read_metadata
 from playslot_rl.data.metadata import DATA_PATH, FORMAT_TAG, INFO_NAME
-from playslot_rl.data.places import Problems, filled, is_plain_path
-from playslot_rl.data.tables import MOST_ROWS, Array, Episode, read_columns
+from playslot_rl.data.places import SHOWN, Problems, filled, is_plain_path
+from playslot_rl.data.tables import MISSING, MOST_ROWS, Array, Episode, read_columns
 from playslot_rl.errors import DEBUG, DataError, HubError, PlaySlotError
 from playslot_rl.runtime.processes import here
 from playslot_rl.storage.atomic import write_error
@@ -147,6 +148,8 @@ def open_remote(address: str, cache: Path) -> Contents:
     if problems.errors or not episodes or len(columns["episode_index"]) != len(index):
         said = problems.errors[0] if problems.errors else f"{len(episodes)} episodes and other rows"
         raise DataError(f"{address}: {said}: {_LOOK}")
+    for line in problems.warnings_of(MISSING)[:SHOWN]:
+        say_once(f"note: {line.replace(str(remote.root), address)}")
     return Contents(remote.root, info, episodes, tasks, list(rows), list(rows.values()), columns, remote)
 
 

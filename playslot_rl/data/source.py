@@ -21,7 +21,7 @@ import numpy.typing as npt
 from playslot_rl import keys
 from playslot_rl.config.weights import is_remote
 from playslot_rl.data.action_limits import ActionLimits, limits_of
-from playslot_rl.data.agreement import open_files
+from playslot_rl.data.agreement import open_files, say_once
 from playslot_rl.data.cache import (
     ENTRY_NAME,
     CachePlace,
@@ -38,6 +38,7 @@ from playslot_rl.data.metadata import stated_size
 from playslot_rl.data.prints import episode_origins, files_fingerprint
 from playslot_rl.data.remote import open_remote
 from playslot_rl.data.stream import FrameStream
+from playslot_rl.data.tables import Array
 from playslot_rl.data.views import FrameRows, Frames, concatenate, views_of_one
 from playslot_rl.errors import DataError
 from playslot_rl.storage.atomic import write_json
@@ -278,8 +279,16 @@ def labels_of(files: Contents) -> dict[str, Any]:
     return {
         "starts": starts,
         "lengths": lengths,
-        "actions": None if actions is None else actions.astype(np.float32).reshape(files.rows, -1),
-        "states": None if states is None else states.astype(np.float32).reshape(files.rows, -1),
+        "actions": None if actions is None else _fractions(files, keys.FEATURE_ACTION, actions),
+        "states": None if states is None else _fractions(files, keys.FEATURE_STATE, states),
         "seeds": None if seeds is None else seeds[starts].astype(np.int64),
         "tasks": np.array([next(iter(episode.tasks), "") for episode in files.episodes], np.str_),
     }
+
+
+def _fractions(files: Contents, name: str, values: Array) -> npt.NDArray[np.float32]:
+    """A feature's values as float32 (F, -1), with a note where whole numbers are too large for it."""
+    fractions = values.astype(np.float32)
+    if values.dtype.kind in "iu" and (np.abs(values.astype(np.float64)) > 2**24).any():
+        say_once(f"note: {files.name}: {name} has whole numbers beyond {2**24}, which float32 rounds")
+    return fractions.reshape(files.rows, -1)

@@ -13,12 +13,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.metadata import CAMERAS, MOST, NUMBERS, OTHERS, WHOLE, damaged, whole
+from playslot_rl.data.metadata import CAMERAS, MOST, NUMBERS, OTHERS, REQUIRED, WHOLE, damaged, whole
 from playslot_rl.data.places import Problems, inside
 
 TASKS_NAME: Final = "meta/tasks.parquet"
 EPISODES_AT_ONCE: Final = 64  # of the metadata with statistics, some 150 columns
 UNREADABLE: Final = "unreadable parquet"
+MISSING: Final = "missing values"  # kind of warning
 WRONG_COLUMN: Final = "wrong column"
 MOST_ROWS: Final = 10**9  # of a data set, its frames or its episodes
 
@@ -45,8 +46,8 @@ class Episode:
 def read_columns(
     paths: Sequence[Path], info: dict[str, Any], problems: Problems, opened: Callable[[Path], Any] = Path
 ) -> tuple[list[Path], list[int], dict[str, Array]]:
-    """The readable ones of some data files, rows of each, and every feature that is no camera; `opened` gives a file as
-    pyarrow takes one."""
+    """The readable ones of some data files, rows of each, and every feature that is no camera, but those with values
+    missing that are no fractions; `opened` gives a file as pyarrow takes one."""
     features = info["features"]
     names = [name for name, feature in features.items() if feature["dtype"] not in CAMERAS]
     files, parts = [], []
@@ -56,7 +57,8 @@ def read_columns(
             files.append(path)
             parts.append(rows)
     counts = [len(rows["index"]) for rows in parts]
-    columns = {name: np.concatenate([rows[name] for rows in parts] or [np.zeros(0, np.int64)]) for name in names}
+    known = [name for name in names if all(name in rows for rows in parts)]
+    columns = {name: np.concatenate([rows[name] for rows in parts] or [np.zeros(0, np.int64)]) for name in known}
     return files, counts, columns
 
 
@@ -79,23 +81,32 @@ def read_table(
         return None
 
 
+class _MissingError(ValueError):
+    """Values are missing for which there is no NaN."""
+
+
 def _to_array(column: Any, shape: Sequence[int]) -> Array:
-    """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects. A ValueError where
-    it has missing values, or another shape."""
+    """A table's column as (n, *shape); the shape (1,) gives (n,). Text and records come as objects, fractions that are
+    missing as NaN. A ValueError where other values are missing, or the shape is another one."""
     import pyarrow as pa
+    import pyarrow.compute as pc
 
     array = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
     if isinstance(array, pa.ChunkedArray):
         array = pa.concat_arrays([chunk.storage for chunk in array.chunks])
     if isinstance(array, pa.DictionaryArray):
         array = array.dictionary_decode()
-    rows = len(array)
-    while isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray) and not array.null_count:
-        if pa.types.is_struct(array.type.value_type):
-            break
+    rows, lists = len(array), (pa.ListArray, pa.LargeListArray, pa.FixedSizeListArray)
+    if isinstance(array, lists) and array.null_count and not pa.types.is_struct(array.type.value_type):
+        none = np.full(shape, None).tolist()
+        array = pa.array([none if row is None else row for row in array.to_pylist()], array.type)
+    while isinstance(array, lists) and not array.null_count and not pa.types.is_struct(array.type.value_type):
+        ends = pc.min_max(pc.list_value_length(array)).as_py()
+        if ends["min"] != ends["max"]:  # their values would move into each other's rows
+            raise ValueError(f"lists of {ends['min']} to {ends['max']} values")
         array = array.flatten()
-    if array.null_count:
-        raise ValueError(f"{array.null_count} missing values")
+    if array.null_count and not pa.types.is_floating(array.type):
+        raise _MissingError(f"{array.null_count} missing values")
     if pa.types.is_nested(array.type):
         objects = np.empty(rows, object)
         objects[:] = array.to_pylist()
@@ -123,6 +134,11 @@ def _columns(
         try:
             rows[name] = _to_array(table.column(name), features[name]["shape"])
             _check_kind(name, rows[name], features[name]["dtype"])
+        except _MissingError as error:
+            if name in REQUIRED:
+                problems.error(WRONG_COLUMN, f"{path}: got column {name} with {error}, expected one in every row")
+                return None
+            problems.warning(MISSING, f"{path}: got column {name} with {error}, expected none: it is left out")
         except (ValueError, TypeError, NotImplementedError) as error:
             expected, reason = tuple(features[name]["shape"]), " ".join(str(error).split())[:120]
             problems.error(

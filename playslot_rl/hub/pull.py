@@ -29,7 +29,7 @@ SPARE = 64 << 20
 @dataclass(frozen=True)
 class PullResult:
     """What a pull did: why that revision, empty if it was asked for; whether the Hub named a fingerprint to compare it
-    with.
+    with; what is untidy in the data set as it was pushed.
     """
 
     repo_id: str
@@ -43,6 +43,7 @@ class PullResult:
     size: int
     fingerprint: str
     compared: bool
+    warnings: tuple[str, ...]
 
     def lines(self) -> list[str]:
         checked = "as pushed" if self.compared else "the Hub names none to compare; files and counts were checked"
@@ -52,6 +53,7 @@ class PullResult:
             f"commit: {self.commit}",
             f"fingerprint: {self.fingerprint} ({checked})",
             f"to: {self.root}",
+            *(f"warning: {line}" for line in self.warnings),
         ]
 
 
@@ -89,11 +91,11 @@ def pull(repo_id: str, root: Path, *, revision: str | None = None, token: str | 
                     _check_version(hub, partial, commit)
                     _check_room(root, partial, wanted)
                     hub.download(wanted, commit, partial)
-                    record, compared = _check_content(hub, partial, commit)
+                    record, compared, warnings = _check_content(hub, partial, commit)
                     size = sum(file.size for file in wanted.values())
                     result = PullResult(
                         hub.name, str(root), name, why, commit, record.episodes, record.frames, len(wanted), size,
-                        record.fingerprint, compared,
+                        record.fingerprint, compared, warnings,
                     )  # fmt: skip
                     _finish(partial, root, result, hub.endpoint)
             finally:
@@ -147,9 +149,9 @@ def _check_room(root: Path, partial: Path, wanted: Mapping[str, RepoFile]) -> No
         )
 
 
-def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubRecord, bool]:
-    """What has arrived, which is removed if it is wrong: fetching it again would not help; and whether the Hub named a
-    fingerprint to compare it with.
+def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubRecord, bool, tuple[str, ...]]:
+    """What has arrived, which is removed if it is wrong: fetching it again would not help; whether the Hub named a
+    fingerprint to compare it with; and what is untidy.
     """
     shutil.rmtree(partial / ".cache", ignore_errors=True)
     try:
@@ -162,9 +164,10 @@ def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubReco
                 "one: an earlier push may have left files behind; ask its owner to push it by `playslot dataset push`"
             )
         found = HubRecord.of(seen.fingerprint, seen.episodes, seen.frames)
+        warnings = tuple(line.replace(f"{partial}/", "") for line in seen.warnings)
         record = read_record(partial)
         if record is None or record.scheme != SCHEME:
-            return found, False
+            return found, False, warnings
         if found != record:
             raise HubError(
                 f"{hub.name}: got {found.episodes} episodes, {found.frames} frames, fingerprint {found.fingerprint}, "
@@ -174,12 +177,12 @@ def _check_content(hub: Repository, partial: Path, commit: str) -> tuple[HubReco
     except (DataError, HubError):
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    return found, True
+    return found, True, warnings
 
 
 def _finish(partial: Path, root: Path, result: PullResult, endpoint: str) -> None:
     """Note the origin, and put the folder in its place."""
-    origin = {key: value for key, value in asdict(result).items() if key not in ("root", "why")}
+    origin = {key: value for key, value in asdict(result).items() if key not in ("root", "why", "warnings")}
     origin |= {"endpoint": endpoint, "pulled": datetime.now(UTC).isoformat(timespec="seconds")}
     write_json(partial / LOCAL_RECORD, origin)
     if root.is_dir():

@@ -69,6 +69,9 @@ def test_episode_metadata_and_statistics_are_lerobots(pair: tuple[Path, Path]) -
         assert ours[name].to_pylist() == theirs[name].to_pylist(), name
     for file in ("info.json", "stats.json"):
         assert json.loads((pair[0] / "meta" / file).read_text()) == json.loads((pair[1] / "meta" / file).read_text())
+    for root in pair:
+        stats, info = (json.loads((root / "meta" / file).read_text()) for file in ("stats.json", "info.json"))
+        assert list(stats) == [name for name in info["features"] if name in stats], "the same in every process"
 
 
 @pytest.mark.integration

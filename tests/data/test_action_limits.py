@@ -75,6 +75,8 @@ def test_a_dimensions_range_is_what_the_statistics_say(tmp_path: Path) -> None:
         {"min": [-1e300, 7.3, 0.0], "max": [1e300, 7.3, 100.0]},
         {"mean": [0.0, 7.3, 50.0]},
         {"min": [-(10**400), 7, 0], "max": [10**400, 8, 100]},
+        {"min": [-1e6, -1e6, -1e6], "max": [1e6, 1e6, 1e6]},
+        {"min": [-1e6, 7.2, -900.0], "max": [90.0, 7.4, 900.0]},
     ],
 )
 def test_statistics_that_cannot_be_used_are_computed_from_the_data(tmp_path: Path, stats: Any) -> None:
@@ -143,6 +145,18 @@ def test_other_types_than_float32_are_read(tmp_path: Path, dtype: str) -> None:
     assert limits.high.tolist() == actions.max(axis=0).astype(np.float32).tolist()
 
 
+@pytest.mark.parametrize(("value", "lines"), [(2**24, 0), (2**24 + 1, 1), (2**62 + 1, 1)])
+def test_whole_numbers_that_float32_rounds_are_noted(
+    tmp_path: Path, value: int, lines: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read = labels_of(files(tmp_path, np.full((4, 3), value, np.int64)))["actions"]
+    assert read.dtype == np.float32
+    said_so = capsys.readouterr().err
+    assert (
+        said_so.count("\n") == said_so.count("action has whole numbers beyond 16777216, which float32 rounds") == lines
+    )
+
+
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
@@ -165,8 +179,25 @@ def test_the_dimensions_are_named_as_the_set_names_them(tmp_path: Path, names: A
 
 @pytest.mark.parametrize("robot", ["button_press", "block_push_easy", "grid_shapes"])
 def test_sets_of_our_own_simulators_have_no_range_of_their_own(tmp_path: Path, robot: str) -> None:
+    within = joints() / 100
+    within[3] = np.nan
+    assert limits_of(files(tmp_path, within, robot=robot), within) is None
+    assert found(tmp_path, joints(), robot=robot).high[2] == joints()[:, 2].max(), "its name is no more than a name"
+    (tmp_path / "meta" / "playslot.json").write_text("{}")
     assert limits_of(files(tmp_path, joints(), robot=robot), joints()) is None
     assert limits_of(files(tmp_path, joints()), None) is None
+
+
+def test_a_range_that_is_stated_far_too_wide_is_said_once_and_no_other_joint_s_is_touched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stats = {"min": [-1e6, 7.3, -10.0], "max": [1e6, 7.3, 110.0]}
+    for _ in range(2):
+        limits = found(tmp_path, joints(), stats=stats)
+    assert limits.low.tolist() == [joints()[:, 0].min(), np.float32(7.3), -10]
+    said_so = capsys.readouterr().err.splitlines()
+    assert len(said_so) == 1
+    assert "meta/stats.json says more than 3 times the range that the actions pan have" in said_so[0]
 
 
 def test_several_sets_have_the_range_that_covers_them(tmp_path: Path) -> None:

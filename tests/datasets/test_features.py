@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from damage import EPISODES, edit_column, load
+from damage import EPISODES, ROWS, edit_column, load, put
 from foreign_features import SHAPES, write_features
 
+from playslot_rl.data.source import open_source
 from playslot_rl.datasets.merge import merge
 from playslot_rl.datasets.repair import repair
 from playslot_rl.datasets.split import split
@@ -46,6 +48,48 @@ def same_as_lerobot(mine: dict[str, Any], theirs: dict[str, Any], spread: float)
 def test_what_lerobot_wrote_is_sound(lengths: tuple[int, ...], tmp_path: Path) -> None:
     result = verify(write_features(tmp_path / "set", lengths))
     assert (result.errors, result.warnings) == ((), ())
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(("name", "value"), [("height", None), ("joints", None), ("joints", [1.0, None, 2.0])])
+def test_a_fraction_that_is_missing_is_nan_and_costs_its_episode_only(
+    name: str, value: Any, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(written, tmp_path / "set"))
+    edit_column(root, ROWS, name, put(9, value))
+    assert len(open_source(root, cache=tmp_path / "cache").frames) == 13
+    assert f"episode 1: got a value of {name} that is NaN" in capsys.readouterr().err
+    assert not verify(root).ok
+    assert verify(root, statistics=False).ok, "as a pull looks at it: nothing that a transfer damages"
+    result = repair(root)
+    assert (result.verification.episodes, len(result.lost)) == (1, 1)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["closed", "words"])
+def test_a_column_with_other_values_missing_is_left_out(
+    name: str, written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(written, tmp_path / "set"))
+    edit_column(root, ROWS, name, put(9, None))
+    assert len(open_source(root, cache=tmp_path / "cache").frames) == 13
+    said = f"got column {name} with 1 missing values, expected none: it is left out"
+    assert said in capsys.readouterr().err
+    result = verify(root)
+    assert (result.ok, len(result.warnings)) == (True, 1)
+    edit_column(root, ROWS, "frame_index", put(9, None))
+    assert "frame_index with 1 missing values" in verify(root).errors[0], "without which no row has a place"
+
+
+@pytest.mark.integration
+def test_lists_of_other_lengths_are_not_moved_into_each_others_rows(written: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(written, tmp_path / "set"))
+    table = pq.ParquetFile(root / ROWS).read()
+    lists = table.column("joints").to_pylist()
+    lists[:2] = [lists[0][:2], [*lists[1], 1.0]]
+    place = table.schema.get_field_index("joints")
+    pq.write_table(table.set_column(place, "joints", pa.array(lists, pa.list_(pa.float32()))), root / ROWS)
+    assert "column joints with lists of 2 to 4 values, expected values of shape (3,)" in verify(root).errors[0]
 
 
 @pytest.mark.integration
