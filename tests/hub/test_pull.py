@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from fake_hub import FakeHub, Fault, Repository
 from small_data import contents, write_small
@@ -192,6 +196,22 @@ def test_data_pushed_by_lerobot_are_pulled_and_the_missing_fingerprint_is_said(
     pushed.commit("main", {path: file for path, file in files.items() if path != "meta/playslot_hub.json"})
     answer = pull(client, tmp_path / "there", revision="main")
     assert "the Hub names none" in answer["lines"][3]
+
+
+def test_a_value_that_is_nan_is_the_owner_s_and_no_fault_of_the_transfer(
+    pushed: Repository, client: Client, tmp_path: Path
+) -> None:
+    files = {path: file for path, file in pushed.files().items() if path != "meta/playslot_hub.json"}
+    name, content = "data/chunk-000/file-000.parquet", io.BytesIO()
+    table = pq.read_table(io.BytesIO(files[name]))
+    actions = pa.array([[math.nan, 0.0], *table.column("action").to_pylist()[1:]], table.schema.field("action").type)
+    pq.write_table(table.set_column(table.schema.get_field_index("action"), "action", actions), content)
+    pushed.commit("main", files | {name: content.getvalue()})
+    answer = pull(client, tmp_path / "there", revision="main")
+    assert answer["lines"][5:] == [
+        "warning: episode 0: got a value of action that is NaN or infinite, expected numbers"
+    ]
+    assert (tmp_path / "there" / name).read_bytes() == content.getvalue()
 
 
 def test_another_format_version_is_refused_before_it_is_fetched(hub: FakeHub, client: Client, tmp_path: Path) -> None:
