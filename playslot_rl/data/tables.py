@@ -98,8 +98,9 @@ def _to_array(column: Any, shape: Sequence[int]) -> Array:
         array = array.dictionary_decode()
     rows, lists = len(array), (pa.ListArray, pa.LargeListArray, pa.FixedSizeListArray)
     if isinstance(array, lists) and array.null_count and not pa.types.is_struct(array.type.value_type):
-        none = np.full(shape, None).tolist()
-        array = pa.array([none if row is None else row for row in array.to_pylist()], array.type)
+        cells = array.to_pylist()
+        none = [None] * len(next((row for row in cells if row is not None), ()))
+        array = pa.array([none if row is None else row for row in cells], array.type)
     while isinstance(array, lists) and not array.null_count and not pa.types.is_struct(array.type.value_type):
         ends = pc.min_max(pc.list_value_length(array)).as_py()
         if ends["min"] != ends["max"]:  # their values would move into each other's rows
