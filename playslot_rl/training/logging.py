@@ -11,6 +11,7 @@ import json
 import math
 import os
 import threading
+import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -105,9 +106,9 @@ class _RunLogger:
         self._module.finish()
 
 
-def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int) -> _TensorBoardLogger | _RunLogger | None:
-    """Open a backend in a folder, for the training of that name; None where there is none. Entries that a killed run
-    wrote after the step it carries on from, `resumed`, are hidden.
+def open_logger(config: LoggingConfig, folder: Path, resumed: int) -> _TensorBoardLogger | _RunLogger | None:
+    """Open a backend in a training's `logs`; None where there is none. Entries that a killed run wrote after the step
+    it carries on from, `resumed`, are hidden.
 
     Raises:
         ConfigError: the backend's package is not installed.
@@ -124,10 +125,14 @@ def open_logger(config: LoggingConfig, folder: Path, name: str, resumed: int) ->
             f"logging.backend={config.backend}: the package {config.backend} is not installed; install it by "
             f"`pip install 'playslot_rl[{config.backend}]'`, or use logging.backend=tensorboard"
         ) from error
-    run_name = f"{folder.resolve().parent.parent.name}-{name}"
-    settings: dict[str, Any] = {"project": config.project, "name": run_name, "resume": "allow"}
+    own = folder / "run_id"  # kept: a folder that is moved goes on, and one of the same name elsewhere is another
+    if not own.is_file():
+        write_text(own, uuid.uuid4().hex[:8])
+    run_id = own.read_text()
+    name = "-".join([*folder.resolve().parts[-4:-1], run_id])  # RUN and its stage, of which a part may have a folder
+    settings: dict[str, Any] = {"project": config.project, "name": name, "resume": "allow"}
     if config.backend == "wandb":
-        settings |= {"dir": str(folder), "id": run_name, "mode": os.environ.get("WANDB_MODE", "online")}
+        settings |= {"dir": str(folder), "id": run_id, "mode": os.environ.get("WANDB_MODE", "online")}
     return _RunLogger(module, settings)
 
 
@@ -168,7 +173,7 @@ class Watch:
         """Log to the backend, too, inside the block; a KeyboardInterrupt in it says where the same command carries on.
         A ConfigError where the backend's package is not installed.
         """
-        self._logger = open_logger(logging, self.folder / "logs", self.name, start)
+        self._logger = open_logger(logging, self.folder / "logs", start)
         try:
             yield
         except KeyboardInterrupt:

@@ -7,11 +7,13 @@ import errno
 import json
 import multiprocessing
 import os
+import shutil
 import sys
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -28,7 +30,7 @@ from playslot_rl.storage.atomic import lock
 from playslot_rl.storage.resume import sittings_of
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
 from playslot_rl.training.fit import Part, fit
-from playslot_rl.training.logging import History
+from playslot_rl.training.logging import History, open_logger
 
 
 def tensors(folder: Path, step: int) -> dict[str, torch.Tensor]:
@@ -321,6 +323,19 @@ def test_a_missing_logging_package_names_the_extra(tmp_path: Path, monkeypatch: 
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ConfigError, match=r"playslot_rl\[wandb\]"):
         fit(Part("toy", ToyStage(), toy_config()), tmp_path, seed=3, logging=LoggingConfig(backend="wandb"))
+
+
+def test_each_training_has_a_tracked_run_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[dict[str, Any]] = []
+    monkeypatch.setitem(sys.modules, "wandb", SimpleNamespace(init=lambda **given: opened.append(given)))
+    folders = [tmp_path / run / part for run in ("a/seed0", "b/seed0") for part in ("policy", "policy/decoder")]
+    for folder in folders:
+        open_logger(LoggingConfig(backend="wandb"), folder / "logs", 0)
+    assert len({given["id"] for given in opened}) == len({given["name"] for given in opened}) == len(folders)
+    assert all("seed0-policy" in given["name"] for given in opened)
+    shutil.move(tmp_path / "a", tmp_path / "moved")  # and carried on
+    open_logger(LoggingConfig(backend="wandb"), tmp_path / "moved" / "seed0" / "policy" / "logs", 4)
+    assert opened[-1]["id"] == opened[0]["id"]
 
 
 def test_the_stored_state_is_readable_json(tmp_path: Path) -> None:
