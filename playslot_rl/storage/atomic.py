@@ -86,6 +86,15 @@ def lock(handle: int, *, shared: bool = False, without_locks: bool = True) -> bo
     return True
 
 
+def unlock(handle: int) -> None:
+    """Give a lock back and close its file; closing alone leaves it to processes that were forked meanwhile."""
+    with contextlib.suppress(ImportError, OSError):
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_UN)
+    os.close(handle)
+
+
 def is_open_at(handle: int, path: Path) -> bool:
     """Whether an open file or folder still has that name."""
     try:

@@ -1,27 +1,29 @@
 """Locks between processes: of a file, and of a folder, which any number of them read together and one alone removes.
 
 The system drops the locks of a process that ends, however it ends; the files stay. A folder's lock is held by an open
-file, so two uses within one process are two, too. Where the system has no `flock` (Windows) folders are not locked:
-there a file that is mapped cannot be removed anyway.
+file, so two uses within one process are two, too. Where the system (Windows) or the file system has no `flock` nothing
+is locked: nobody is kept out, and nothing is left behind that would keep anybody out.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
+import time
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from filelock import FileLock, Timeout
-
 from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import explain_write_errors, is_open_at, lock, temporary_name
+from playslot_rl.storage.atomic import explain_write_errors, is_open_at, lock, temporary_name, unlock
 
 NAME: Final = "in_use.lock"
 """Of the file in the folder; its time says when the folder was last taken."""
+POLL: Final = 0.05
+"""Seconds between two looks at a lock that another process holds."""
 
 
 @contextlib.contextmanager
@@ -32,16 +34,29 @@ def locked(path: Path, busy: str = "", patience: float = 0.0) -> Iterator[None]:
         busy: one line for the OutputError where another process holds it; empty waits for that process instead.
         patience: seconds until that error; children of a killed process hold its locks until they notice.
     """
-    mine = FileLock(path, timeout=patience if busy else -1)
-    try:
-        with explain_write_errors(path):
-            mine.acquire()
-    except Timeout:
-        raise OutputError(busy) from None
+    until = time.monotonic() + patience if busy else math.inf
+    while (handle := _taken(path)) is None:
+        if time.monotonic() >= until:
+            raise OutputError(busy)
+        time.sleep(POLL)
     try:
         yield
     finally:
-        mine.release()
+        unlock(handle)
+
+
+def _taken(path: Path) -> int | None:
+    """The file, open and this process's alone; None where another one has it, or it was removed meanwhile."""
+    with explain_write_errors(path):
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    try:
+        if lock(handle) and is_open_at(handle, path):
+            return handle
+    except BaseException:
+        os.close(handle)
+        raise
+    os.close(handle)
+    return None
 
 
 def share(folder: Path) -> int | None:

@@ -15,10 +15,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 
 from playslot_rl import cli
 from playslot_rl.recipes import compare_job
+from playslot_rl.storage.locks import locked
 from playslot_rl.studies import launch
 from playslot_rl.studies.launch import Status
 
@@ -47,7 +47,7 @@ def finished_pipeline(tmp_path_factory: pytest.TempPathFactory, worker_id: str) 
     base = tmp_path_factory.getbasetemp()
     shared = base if worker_id == "master" else base.parent
     run, said = shared / "smoke" / "run", shared / "smoke.json"
-    with FileLock(f"{said}.lock"):
+    with locked(said.with_suffix(".lock")):
         if not said.is_file():
             done = playslot("pipeline", "preset=smoke", f"out={run}", "episodes=2", *ONE_CORE)
             said.write_text(json.dumps(asdict(done)))

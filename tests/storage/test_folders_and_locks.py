@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import multiprocessing
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -82,3 +85,27 @@ def test_a_lock_that_another_process_holds_is_refused_until_it_ends(tmp_path: Pa
     holder.wait()
     with locked(path, "got another process, wait for it"), locked(tmp_path / "other"):
         pass
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_without_locks_nobody_is_kept_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    def flock(*_: object) -> None:
+        raise OSError(code, "no locks")
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    path = tmp_path / "lock"
+    path.write_text("12345\nanother machine\n")  # as a killed process of another version leaves it
+    with locked(path, "got another process, wait for it"):
+        pass
+
+
+def test_a_lock_that_is_given_back_stays_with_no_child(tmp_path: Path) -> None:
+    with locked(tmp_path / "lock"):
+        child = multiprocessing.get_context("fork").Process(target=time.sleep, args=(30,))
+        child.start()
+    try:
+        with locked(tmp_path / "lock", "got another process, wait for it"):
+            pass
+    finally:
+        child.kill()
+        child.join()
