@@ -277,8 +277,9 @@ class _Run:
             values = {key: float(value) for key, value in self.stage.validate(done).items()}
         self._train_mode(True)
         kept = finite(values)
-        if values and not kept:
-            raise self.watch.not_finite("validation", next(iter(values)) + " not finite", f"step {done}")
+        watched = values.keys() if self.patience is None else {self.patience.watched}
+        if values and not watched & kept.keys():
+            raise self.watch.not_finite("validation", next(iter(watched)) + " not finite", f"step {done}")
         return kept
 
     def _look(self, done: int) -> None:

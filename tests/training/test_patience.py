@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from toy_stage import toy_config
 
-from playslot_rl.errors import CheckpointError
+from playslot_rl.errors import CheckpointError, TrainingError
 from playslot_rl.seeds.draws import StepGenerators
 from playslot_rl.storage.resume import TrainingState
 from playslot_rl.training.fit import Part, fit
@@ -88,6 +88,16 @@ def test_a_training_that_ended_early_is_not_carried_on(tmp_path: Path) -> None:
     assert stage.seen == 0
     assert second == first
     assert stage.modules["counter"].get_buffer("steps").item() == 16
+
+
+@pytest.mark.parametrize("good", [0, 2])
+def test_a_watched_number_that_is_none_ends_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, good: int
+) -> None:
+    errors = [*ERRORS[:good], float("nan"), *ERRORS[good + 1 :]]
+    monkeypatch.setattr(Counter, "validate", lambda _, step: {"step": step, "error": errors[step // 4 - 1]})
+    with pytest.raises(TrainingError, match=rf"toy: validation is error not finite at step {4 * good + 4}, expected"):
+        train(tmp_path, 2)
 
 
 def test_another_interval_of_validations_is_another_training(tmp_path: Path) -> None:
