@@ -167,7 +167,9 @@ def read_stage(path: Path, stage: str) -> StageCheckpoint:
         )
     weights = path / "weights.safetensors"
     if not weights.is_file():
-        raise CheckpointError(f"{weights} is missing, expected the stage's weights: train {stage} again")
+        raise CheckpointError(
+            f"{weights} is missing, expected the stage's weights: delete {path} and train {stage} again"
+        )
     return StageCheckpoint(path, stage, config, meta, weights_fingerprint(weights))
 
 
@@ -185,7 +187,8 @@ def require_whole(checkpoint: StageCheckpoint) -> None:
     if checkpoint.fingerprint != saved:
         raise CheckpointError(
             f"{checkpoint.path / 'weights.safetensors'}: got fingerprint {checkpoint.fingerprint}, expected {saved} "
-            f"from its meta.json: the file was changed or damaged; put it back, or train {checkpoint.stage} again"
+            f"from its meta.json: the file was changed or damaged; put it back, or delete {checkpoint.path} and run "
+            f"`playslot {training_command(checkpoint.stage)}` again"
         )
 
 

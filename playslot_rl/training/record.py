@@ -29,13 +29,14 @@ from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK
 from playslot_rl.runtime.devices import open_device
 from playslot_rl.runtime.processes import here, wait
-from playslot_rl.storage.atomic import explain_write_errors
+from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing
 from playslot_rl.storage.checkpoints import (
     StageCheckpoint,
     checkpoint_folder,
     read_stage,
     require_config,
     require_parents,
+    require_whole,
     save_stage,
     training_command,
 )
@@ -120,12 +121,8 @@ class StageRecord:
         return split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
 
     def seen(self, frames: int) -> dict[str, Any]:
-        """For the checkpoint of a stage that sees clips of so many frames: how many episodes there are, which share of
-        them validates, and how many of the demonstrations were left out (`playslot_rl.evaluation.held_out`).
-        """
-        data = self.config.data
-        shares = {"validation": data.validation, "held_out": data.held_out}
-        return {"episodes": self.data.episodes, **shares, "clip_frames": frames}
+        """For the checkpoint of a stage that sees clips of so many frames: how many episodes there are."""
+        return {"episodes": self.data.episodes, "clip_frames": frames}
 
     def clips(self, frames: int, shown: int = 32) -> Clips:
         """Clips of the videos, some of their episodes (`data.validation`) held out; `shown` of these at most validate.
@@ -205,12 +202,13 @@ class StageRecord:
         """The finished stage, after saying that it is skipped; None if it is not finished.
 
         Raises:
-            CheckpointError: it was trained otherwise.
+            CheckpointError: it was trained otherwise, or is damaged.
         """
         path = checkpoint_folder(self.run, self.name)
         if not (path / "meta.json").is_file():
             return None
         done = read_stage(path, self.name)
+        require_whole(done)
         require_parents(done, self.parents)
         require_config(done, self.finishes(), self.spec.typed)
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
@@ -223,6 +221,7 @@ class StageRecord:
             if any(seen):  # versions before named the first of several
                 facts.append(("data.camera", ",".join(cameras[: len(seen)]), ",".join(seen)))
             facts.append(("data.drawn", self.drawn or "false", done.meta.get("drawn") or "false"))
+            facts += self._windows(done) if self.role == "train" else []
         if self.spec.labels and self.roots:
             facts.append((LABELS, self.labels, done.meta.get("labelled")))
         if self.role == "demos" and self.roots:
@@ -250,6 +249,15 @@ class StageRecord:
             if other.data.fingerprint == fingerprint:
                 return other
         return self
+
+    def _windows(self, done: StageCheckpoint) -> list[tuple[str, object, object]]:
+        """What decides which clips a model of videos saw, each as it is now and was then; checkpoints of before do not
+        say it, but the run's config may.
+        """
+        told = json_or_nothing(self.run / "config.json").get("data", {}) | done.meta
+        keys = ("validation", "shuffle_buffer") if self.config.data.stream else ("validation",)
+        own = [(key, getattr(self.config.data, key)) for key in keys]
+        return [(f"data.{key}", value, told.get(key, value)) for key, value in own]
 
     def finishes(self) -> dict[str, Any]:
         """Parts of `stored`, nested as there, that a finished stage must share."""

@@ -21,15 +21,18 @@ from playslot_rl.data.windows import split_episodes
 def taught(source: EpisodeFrames, config: ExperimentConfig, extra: Mapping[str, Any], demos: bool) -> dict[str, Any]:
     """For the checkpoint of a stage with `extra` facts: `trained_on`, the `origins` of its episodes, of clips
     (`StageRecord.seen`) without those that validated; of demonstrations the mean of the actions that it was shown, of
-    videos how many demonstrations were left out.
+    videos how many demonstrations were left out, which share of the clips validates, and how a stream was shuffled.
     """
     training: IntArray = np.arange(source.episodes)
     if "clip_frames" in extra:
         fits = source.lengths >= extra["clip_frames"]
         training, _ = split_episodes(source.episodes, config.data.validation, config.seed, fits, source.recorded)
     origins = None if source.origins is None else sorted(set(source.origins[training].tolist()))
-    rest = mean_actions(source, extra.get("labelled_demos")) if demos else {"held_out": config.data.held_out}
-    return {"trained_on": origins, **rest}
+    if demos:
+        return {"trained_on": origins, **mean_actions(source, extra.get("labelled_demos"))}
+    own = config.data
+    drawn = {"shuffle_buffer": own.shuffle_buffer} if own.stream else {}
+    return {"trained_on": origins, "held_out": own.held_out, "validation": own.validation, **drawn}
 
 
 def mean_actions(source: EpisodeFrames, labelled: int | None) -> dict[str, list[float]]:

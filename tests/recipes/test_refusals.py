@@ -125,6 +125,10 @@ REFUSED = [
     ),
     ("train-slots out={run} data.root={videos} slots.steps=9", "slots.steps: got 9, expected 6"),
     ("train-slots out={run} data.root={videos} seed=1", "seed: got 1, expected 0"),
+    (
+        "train-slots out={run} data.root={videos} data.validation=0.5",
+        r"data.validation: got 0.5, expected \S+ as .* was",
+    ),
     ("train-dynamics run={run} model.predictor.dim=64", "model.predictor.dim: got 64, expected 32"),
     ("train-dynamics run={run} dynamics.optim.lr=1", "dynamics.optim.lr: got 1.0, expected 0.001"),
     ("train-policy run={run} behaviour.labelled_demos=2", "behaviour.labelled_demos: got 2, expected 3"),

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -77,6 +78,29 @@ def test_a_new_run_is_one_commands_too(
     assert "another command is training" in done.err
     assert json.loads((run / "config.json").read_text())["seed"] == 0
     assert weights(run, "slots") == weights(shared_run, "slots")
+
+
+def test_a_damaged_finished_stage_is_said_and_made_again_as_told(run: Path) -> None:
+    command, kept = ("train-slots", f"out={run}", f"data.root={run}/data/random"), weights(run, "slots")
+    folder = run / "slots" / "checkpoint"
+    content = bytearray((folder / "weights.safetensors").read_bytes())
+    content[-5] ^= 0xFF
+    (folder / "weights.safetensors").write_bytes(content)
+    refused(*command, message=f"changed or damaged; put it back, or delete {folder} and run `playslot train-slots`")
+    shutil.rmtree(folder)
+    smoke(*command)
+    assert weights(run, "slots") == kept
+
+
+def test_a_stage_finished_before_it_said_its_validation_is_told_by_the_runs_config(run: Path) -> None:
+    command, path = ("train-slots", f"out={run}", f"data.root={run}/data/random"), run / "slots/checkpoint/meta.json"
+    meta = json.loads(path.read_text())
+    del meta["validation"]
+    path.write_text(json.dumps(meta))
+    assert "skipped" in smoke(*command).out
+    refused(*command, "data.validation=0.5", message="data.validation: got 0.5, expected ")
+    (run / "config.json").unlink()
+    assert "skipped" in smoke(*command, "data.validation=0.5").out
 
 
 @pytest.mark.parametrize("method", METHODS)
