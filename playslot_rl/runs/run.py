@@ -24,7 +24,7 @@ from playslot_rl.config.plain import nearest
 from playslot_rl.data.contents import with_full_cameras
 from playslot_rl.errors import CheckpointError
 from playslot_rl.storage.atomic import json_or_nothing, read_json, write_bytes, write_json
-from playslot_rl.storage.folders import new_folder
+from playslot_rl.storage.folders import copy_files, new_folder
 
 if TYPE_CHECKING:
     import torch
@@ -226,16 +226,7 @@ class Run:
         self.require_room(checkpoint)
         target = self.place(checkpoint.stage)
         if not target.exists():
-            _copy_files(checkpoint.path, target)
-
-    def take_training(self, source: str, stage: str, steps: int) -> None:
-        """Copy the checkpoint at `steps` of another run's training of a stage, if it has reached them and this run has
-        none of its own. The training that carries on from it refuses it unless it is the same one.
-        """
-        name = f"step_{steps:08d}"
-        there, target = Path(source) / stage / "checkpoints" / name, self.folder / stage / "checkpoints" / name
-        if not target.parent.exists() and (there / "state.json").is_file():
-            _copy_files(there, target)
+            copy_files(checkpoint.path, target)
 
     def build_on(self, parent: Run) -> None:
         """Name the world model of `parent` as that of this run, unless it is its own."""
@@ -243,9 +234,3 @@ class Run:
         if self.folder.resolve() not in (home.resolve(), parent.folder.resolve()):
             source = parent.name if parent.pretrained else os.path.relpath(home, self.folder)
             write_json(self.folder / "world_model.json", {"source": source})
-
-
-def _copy_files(source: Path, target: Path) -> None:
-    with new_folder(target, replace=True) as temporary:
-        for file in sorted(source.iterdir()):
-            write_bytes(temporary / file.name, file.read_bytes())

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from playslot_rl.errors import OutputError
-from playslot_rl.storage.atomic import explain_write_errors, lock, replace_dir, temporary_name
+from playslot_rl.storage.atomic import explain_write_errors, lock, replace_dir, temporary_name, write_bytes
 
 
 def require_free(out: Path, key: str = "out=") -> None:
@@ -119,3 +119,10 @@ def remove_leftovers(final: Path) -> None:
         with contextlib.suppress(OSError), held(leftover) as free:
             if free:
                 shutil.rmtree(leftover, ignore_errors=True)
+
+
+def copy_files(source: Path, target: Path) -> None:
+    """Copy the files of a folder into another one, which appears whole and replaces what is there."""
+    with new_folder(target, replace=True) as temporary:
+        for file in sorted(source.iterdir()):
+            write_bytes(temporary / file.name, file.read_bytes())

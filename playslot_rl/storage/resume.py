@@ -21,11 +21,11 @@ from torch import Tensor, nn
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.plain import flatten
-from playslot_rl.config.roles import earlier
+from playslot_rl.config.roles import earlier, keys_of
 from playslot_rl.errors import CheckpointError, OutputError
 from playslot_rl.runtime.devices import device_name
-from playslot_rl.storage.atomic import read_json, write_json
-from playslot_rl.storage.folders import new_folder, remove_leftovers
+from playslot_rl.storage.atomic import json_or_nothing, read_json, write_json
+from playslot_rl.storage.folders import copy_files, new_folder, remove_leftovers
 from playslot_rl.storage.tensors import load_into, load_modules, load_tensors, module_tensors, save_tensors
 
 FORMAT = "playslot_rl.training/1"
@@ -60,13 +60,19 @@ def first_difference(
 ) -> tuple[str, Any, Any] | None:
     """The first dotted key at which two nested configs differ: (key as it is typed, stored value, wanted value).
 
-    A wanted precision of `auto` is equal to any that was stored. A key that came after what is stored counts as what
-    was computed without it (`playslot_rl.config.roles.was`). `typed` makes of a key as it is stored the full name under
-    which it is typed.
+    A wanted precision of `auto` is equal to any that was stored, a key of the machine to any, and so is the place of
+    what a training started from where both say what that was (`started_from`). A key that came after what is stored
+    counts as what was computed without it (`playslot_rl.config.roles.was`). `typed` makes of a key as it is stored the
+    full name under which it is typed.
     """
     right, known = flatten(wanted), earlier(ExperimentConfig)
     left = {**{key: known[typed(key)] for key in right if typed(key) in known}, **flatten(stored)}
+    places = keys_of(ExperimentConfig, "machine")
+    if "started_from" in left.keys() & right.keys():
+        places |= {"slots.start_from"}
     for key in sorted(left.keys() | right.keys()):
+        if typed(key) in places:
+            continue
         if key.rpartition(".")[-1] == "precision" and right.get(key) == "auto":
             continue  # whatever this processor is good at: a run goes on on another one
         if left.get(key, _ABSENT) != right.get(key, _ABSENT):
@@ -96,6 +102,13 @@ class TrainingCheckpoints:
         """The newest checkpoint, or None."""
         saved = self.saved()
         return saved[-1] if saved else None
+
+    def take(self, source: Path) -> None:
+        """Copy another run's checkpoint, unless it is of another training or there is one here."""
+        stored = json_or_nothing(source / "state.json")
+        same = stored.get("format", FORMAT) == FORMAT and "identity" in stored
+        if same and not self.folder.exists() and self._difference(stored) is None:
+            copy_files(source, self.folder / source.name)
 
     def save(
         self,
@@ -152,6 +165,9 @@ class TrainingCheckpoints:
             shutil.rmtree(old)
         return final
 
+    def _difference(self, stored: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+        return first_difference(stored["identity"], self.identity, self.typed)
+
     def _newest(self) -> tuple[Path, dict[str, Any]] | None:
         """The newest checkpoint and its `state.json`, checked to belong to this run; None if there is none."""
         if self.folder.exists() and not self.folder.is_dir():
@@ -171,7 +187,7 @@ class TrainingCheckpoints:
         missing = {"format", "step", "seconds", "metrics", "identity"} - stored.keys()
         if missing:
             raise CheckpointError(f"{path} is damaged (no {', '.join(sorted(missing))}): {cure}")
-        difference = first_difference(stored["identity"], self.identity, self.typed)
+        difference = self._difference(stored)
         if difference is not None:
             key, old, new = difference
             raise CheckpointError(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import shifted_copies
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.runs import Run
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
@@ -45,10 +44,10 @@ def demonstration_views(
     return [(demos.trained, parse(demos.parsed)), *shifted_views], held_out
 
 
-def policy_taken_over(config: ExperimentConfig, record: StageRecord, steps: int) -> Callable[[], None] | None:
-    """Takes over the finished policy training of the run `behaviour.policy_from` names, if it is the same one."""
+def policy_taken_over(config: ExperimentConfig, record: StageRecord, steps: int) -> Path | None:
+    """Where the run that `behaviour.policy_from` names has its finished policy training; None where it names none."""
     source = config.behaviour.policy_from
-    return partial(Run(record.run).take_training, source, record.name, steps) if source else None
+    return Path(source) / record.name / "checkpoints" / f"step_{steps:08d}" if source else None
 
 
 def _without_actions(source: EpisodeFrames) -> str:

@@ -128,6 +128,21 @@ def fit(
     return run.state, start
 
 
+def own_checkpoints(
+    part: Part, folder: Path, seed: int, identity: Mapping[str, Any], typed: Callable[[str], str]
+) -> TrainingCheckpoints:
+    """What a part in that folder carries on from; the rest as of `fit`."""
+    own = {part.name: without(part.config, "free"), "seed": seed}
+    if part.patience is not None:  # when it looks decides where it ends
+        own["validate_every"] = part.config.validate_every
+    begins = f"{part.name}."
+    return TrainingCheckpoints(
+        folder / "checkpoints",
+        {**own, **identity, **part.identity},
+        lambda key: part.typed(key.removeprefix(begins)) if key.startswith(begins) else typed(key),
+    )
+
+
 class _Run:
     """One process's part of a stage: the pieces `fit` moves from step to step."""
 
@@ -148,15 +163,7 @@ class _Run:
         self.steps = Steps(part.name, part.group or part.name, self.batches, self.optimizer, part.config, seed, device)
         ema = part.config.optim.ema
         self.average = WeightAverage(self.parameters, ema) if ema else None
-        own = {part.name: without(part.config, "free"), "seed": seed}
-        if part.patience is not None:  # when it looks decides where it ends
-            own["validate_every"] = part.config.validate_every
-        begins = f"{part.name}."
-        self.checkpoints = TrainingCheckpoints(
-            folder / "checkpoints",
-            {**own, **identity, **part.identity},
-            lambda key: part.typed(key.removeprefix(begins)) if key.startswith(begins) else typed(key),
-        )
+        self.checkpoints = own_checkpoints(part, folder, seed, identity, typed)
         cure = f"lower {part.typed('optim.lr')} or check the data"
         self.watch = Watch(part.name, folder, self.checkpoints, cure)
         self.state = self.checkpoints.resume(part.stage.modules, self.optimizer, self.parameters, self._averaged)

@@ -24,7 +24,7 @@ from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrat
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.videos import open_videos
-from playslot_rl.errors import CheckpointError, DataError
+from playslot_rl.errors import CheckpointError, DataError, OutputError
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK
 from playslot_rl.runtime.devices import open_device
@@ -210,7 +210,7 @@ class StageRecord:
         done = read_stage(path, self.name)
         require_whole(done)
         require_parents(done, self.parents)
-        require_config(done, self.finishes(), self.spec.typed)
+        require_config(done, self._with_started(self.finishes(), done), self.spec.typed)
         facts: list[tuple[str, object, object]] = [("seed", self.config.seed, done.meta.get("seed", self.config.seed))]
         own = self
         if self.role and self.roots:  # a finished stage can be asked for without
@@ -249,6 +249,13 @@ class StageRecord:
             if other.data.fingerprint == fingerprint:
                 return other
         return self
+
+    def _with_started(self, wanted: dict[str, Any], done: StageCheckpoint) -> dict[str, Any]:
+        """With the place from which slots started as it was said then, where the same ones lie at that of now."""
+        own, old = (config.get("slots", {}).get("start_from") for config in (wanted, done.config))
+        if own and old and own != old and Run.open(own).stage("slots").fingerprint == done.meta.get("started_from"):
+            wanted["slots"]["start_from"] = old
+        return wanted
 
     def _windows(self, done: StageCheckpoint) -> list[tuple[str, object, object]]:
         """What decides which clips a model of videos saw, each as it is now and was then; checkpoints of before do not
@@ -330,6 +337,8 @@ class StageRecord:
                 if here().first:
                     if not begun:
                         hold()
+                        if any(self.folder.glob("**/checkpoint*/*")):  # of one that was quicker, and has ended
+                            raise OutputError(busy)
                     begun = True
                     Run(self.run).store(self.config)
                     self.ready()

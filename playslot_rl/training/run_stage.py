@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -17,7 +18,7 @@ from playslot_rl.modules.action_range import range_of
 from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.storage.resume import sittings_of
-from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.fit import Part, fit, own_checkpoints
 from playslot_rl.training.patience import Patience
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.stage import ClipStage
@@ -34,7 +35,7 @@ class Training:
         line: the closing line, from the metrics.
         extra: more plain values for `meta.json`.
         identity: further plain values that a half-finished stage must share.
-        adopt: takes over another run's training before the first step; called by the first of several processes.
+        adopt: another run's checkpoint, from which the first part carries on if it is of the same training.
     """
 
     parts: Iterable[Part]
@@ -42,7 +43,7 @@ class Training:
     line: Callable[[Mapping[str, float]], str]
     extra: Mapping[str, Any] = field(default_factory=dict)
     identity: Mapping[str, Any] = field(default_factory=dict)
-    adopt: Callable[[], None] | None = None
+    adopt: Path | None = None
 
     def carry_out(self, record: StageRecord, begin: Callable[[], None]) -> StageCheckpoint:
         return _train(record, self, begin)
@@ -111,11 +112,6 @@ def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageChec
 
 
 def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -> StageCheckpoint:
-    if training.adopt is not None:
-        begin()
-        if here().first:
-            training.adopt()
-        wait()
     modules: dict[str, nn.Module] = {}
     metrics: dict[str, float] = {}
     steps, seconds, clocked = 0, 0.0, False
@@ -128,13 +124,20 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
         if limits is not None:
             for known in filter(None, map(range_of, part.stage.modules.values())):
                 limits.give(known)
+        identity = {**record.resumes(), **training.identity}
+        if training.adopt is not None and not part.folder:
+            begin()
+            if here().first:
+                own = own_checkpoints(part, record.folder, record.config.seed, identity, record.spec.typed)
+                own.take(training.adopt)
+            wait()
         state, _ = fit(
             part,
             record.folder,
             seed=record.config.seed,
             device=training.device,
             logging=record.config.logging,
-            identity={**record.resumes(), **training.identity},
+            identity=identity,
             typed=record.spec.typed,
             ready=begin,
         )

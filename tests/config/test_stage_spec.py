@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from playslot_rl.config import ExperimentConfig
@@ -40,6 +42,34 @@ def test_a_key_that_came_later_is_known_by_its_full_name_alone() -> None:
     wanted = {"model": {"predictor": {"kind": "cocvp"}}, "render": {"kind": "cocvp"}}
     assert first_difference({}, wanted, spec.typed) == ("render.kind", "nothing", "cocvp")
     assert first_difference({"render": {"kind": "cocvp"}}, wanted, spec.typed) is None
+
+
+@pytest.mark.parametrize(
+    ("stored", "wanted", "expected"),
+    [
+        ({"behaviour": {"policy_from": "a"}}, {"behaviour": {"policy_from": "b"}}, None),
+        ({"behaviour": {"policy_from": "a"}}, {}, None),
+        (
+            {"slots": {"start_from": "a"}, "started_from": "1"},
+            {"slots": {"start_from": "b"}, "started_from": "1"},
+            None,
+        ),
+        (
+            {"slots": {"start_from": "a"}, "started_from": "1"},
+            {"slots": {"start_from": "a"}, "started_from": "2"},
+            ("started_from", "1", "2"),
+        ),
+        (
+            {"slots": {"start_from": ""}},
+            {"slots": {"start_from": "b"}, "started_from": "1"},
+            ("slots.start_from", "", "b"),
+        ),
+    ],
+)
+def test_a_place_is_no_difference_where_what_lies_there_is_the_same(
+    stored: dict[str, Any], wanted: dict[str, Any], expected: tuple[str, str, str] | None
+) -> None:
+    assert first_difference(stored, wanted) == expected
 
 
 def test_what_a_checkpoint_keeps_follows_from_its_keys() -> None:

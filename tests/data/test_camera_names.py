@@ -66,8 +66,8 @@ def test_a_depth_map_is_no_camera_to_learn_from(two: Path, tmp_path: Path) -> No
     info["features"][SIDE]["info"] = {"is_depth_map": True}
     (root / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(DataError, match=rf"data\.camera=side: got a depth map, .* {TOP}$"):
-        open_source(root, "side", tmp_path / "cache")
-    assert open_source(root, "", tmp_path / "cache").camera == TOP  # the only one of colours
+        open_sources(root, "side", tmp_path / "cache")
+    assert open_sources(root, "", tmp_path / "cache").camera == TOP  # the only one of colours
 
 
 def test_all_readers_take_the_short_name_for_the_same_frames(two: Path, tmp_path: Path) -> None:

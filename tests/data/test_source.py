@@ -93,10 +93,10 @@ def test_the_fingerprint_follows_videos_wherever_their_template_puts_them(foreig
     for camera in (top, side):
         (root / "clips" / "chunk-000").mkdir(parents=True, exist_ok=True)
         shutil.move(root / "videos" / camera / "chunk-000", root / "clips" / "chunk-000" / camera)
-    before = [open_source(root, camera, tmp_path, buffer=9).fingerprint for camera in (top, side)]
+    before = [open_sources(root, camera, tmp_path, buffer=9).fingerprint for camera in (top, side)]
     with next((root / "clips" / "chunk-000" / top).iterdir()).open("ab") as file:
         file.write(bytes(64))
-    after = [open_source(root, camera, tmp_path, buffer=9).fingerprint for camera in (top, side)]
+    after = [open_sources(root, camera, tmp_path, buffer=9).fingerprint for camera in (top, side)]
     assert after[0] != before[0]
     assert after[1] == before[1]
 

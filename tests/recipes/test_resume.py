@@ -103,6 +103,16 @@ def test_a_stage_finished_before_it_said_its_validation_is_told_by_the_runs_conf
     assert "skipped" in smoke(*command, "data.validation=0.5").out
 
 
+@pytest.mark.parametrize("left", ["checkpoints/step_00000003", "decoder/checkpoints/step_00000003", "checkpoint/meta"])
+def test_a_command_that_was_quicker_on_a_new_run_is_not_trained_over(tmp_path: Path, left: str) -> None:
+    slots = record.StageRecord(METHODS["playslot"].stages[0], tmp_path / "run", compose())
+    with slots.training() as begin:
+        (slots.folder / left).mkdir(parents=True)  # begun and ended since this one looked
+        with pytest.raises(OutputError, match="whose slots another command is training"):
+            begin()
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_kill_before_the_first_file_of_a_run_leaves_no_foreign_folder(tmp_path: Path, method: str) -> None:
     for names in ((), ("training.lock",)):

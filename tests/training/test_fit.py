@@ -29,7 +29,7 @@ from playslot_rl.runtime.precision import resolve_precision
 from playslot_rl.storage.atomic import lock
 from playslot_rl.storage.resume import sittings_of
 from playslot_rl.storage.tensors import load_tensors, module_tensors, save_tensors
-from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.fit import Part, fit, own_checkpoints
 from playslot_rl.training.logging import History, open_logger
 
 
@@ -323,6 +323,21 @@ def test_a_missing_logging_package_names_the_extra(tmp_path: Path, monkeypatch: 
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(ConfigError, match=r"playslot_rl\[wandb\]"):
         fit(Part("toy", ToyStage(), toy_config()), tmp_path, seed=3, logging=LoggingConfig(backend="wandb"))
+
+
+@pytest.mark.parametrize(
+    ("seed", "begun", "taken"), [(3, False, ["step_00000012"]), (4, False, []), (3, True, ["step_00000001"])]
+)
+def test_another_runs_checkpoint_is_taken_over_if_it_is_the_same_training(
+    tmp_path: Path, seed: int, begun: bool, taken: list[str]
+) -> None:
+    train(tmp_path / "first")
+    own = own_checkpoints(Part("toy", ToyStage(), toy_config()), tmp_path / "own", seed, {}, str)
+    if begun:
+        (own.folder / "step_00000001").mkdir(parents=True)
+    for step in (12, 99):  # the second was not reached
+        own.take(tmp_path / "first" / "checkpoints" / f"step_{step:08d}")
+    assert [path.name for path in own.saved()] == taken
 
 
 def test_each_training_has_a_tracked_run_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
