@@ -1,8 +1,8 @@
 """Locks between processes: of a file, and of a folder, which any number of them read together and one alone removes.
 
 The system drops the locks of a process that ends, however it ends; the files stay. A folder's lock is held by an open
-file, so two uses within one process are two, too. Where the system (Windows) or the file system has no `flock` nothing
-is locked: nobody is kept out, and nothing is left behind that would keep anybody out.
+file, so two uses within one process are two, too. Where the system (Windows) or the file system has no `flock` nobody
+is kept out.
 """
 
 from __future__ import annotations
