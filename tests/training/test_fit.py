@@ -332,7 +332,7 @@ def test_another_runs_checkpoint_is_taken_over_if_it_is_the_same_training(
     tmp_path: Path, seed: int, begun: bool, taken: list[str]
 ) -> None:
     train(tmp_path / "first")
-    own = own_checkpoints(Part("toy", ToyStage(), toy_config()), tmp_path / "own", seed, {}, str)
+    own = own_checkpoints(Part("toy", ToyStage(), toy_config()), tmp_path / "own", seed, {"data": "abc"}, str)
     if begun:
         (own.folder / "step_00000001").mkdir(parents=True)
     for step in (12, 99):  # the second was not reached
