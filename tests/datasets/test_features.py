@@ -14,7 +14,7 @@ import pytest
 from damage import EPISODES, ROWS, edit_column, load, put
 from foreign_features import SHAPES, write_features
 
-from playslot_rl.data.source import open_source
+from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.merge import merge
 from playslot_rl.datasets.repair import repair
 from playslot_rl.datasets.split import split
@@ -57,7 +57,7 @@ def test_a_fraction_that_is_missing_is_nan_and_costs_its_episode_only(
 ) -> None:
     root = Path(shutil.copytree(written, tmp_path / "set"))
     edit_column(root, ROWS, name, put(9, value))
-    assert len(open_source(root, cache=tmp_path / "cache").frames) == 13
+    assert len(open_sources(root, cache=tmp_path / "cache").frames) == 13
     assert f"episode 1: got a value of {name} that is NaN" in capsys.readouterr().err
     assert not verify(root).ok
     assert verify(root, statistics=False).ok, "as a pull looks at it: nothing that a transfer damages"
@@ -72,7 +72,7 @@ def test_a_column_with_other_values_missing_is_left_out(
 ) -> None:
     root = Path(shutil.copytree(written, tmp_path / "set"))
     edit_column(root, ROWS, name, put(9, None))
-    assert len(open_source(root, cache=tmp_path / "cache").frames) == 13
+    assert len(open_sources(root, cache=tmp_path / "cache").frames) == 13
     said = f"got column {name} with 1 missing values, expected none: it is left out"
     assert said in capsys.readouterr().err
     result = verify(root)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from playslot_rl.config import ExperimentConfig, from_dict
 from playslot_rl.config.compare_video import method_of
-from playslot_rl.data.windows import IntArray
+from playslot_rl.data.views import IntArray
 from playslot_rl.envs import RECORDED
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.evaluation.intervals import hierarchical
