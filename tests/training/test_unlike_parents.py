@@ -58,7 +58,8 @@ def test_a_stage_is_finished_with_the_camera_that_it_was_shown(
     camera: str, stored: str | None, skipped: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = replace(moving_square(), camera=camera)
-    done = SimpleNamespace(meta={"data": {"train": source.fingerprint}, "steps": 1, "camera": stored})
+    meta = {"data": {"train": source.fingerprint}, "steps": 1, "camera": stored, "fingerprint": "whole"}
+    done = SimpleNamespace(meta=meta, config={}, fingerprint="whole")
     (tmp_path / "slots" / "checkpoint").mkdir(parents=True)
     (tmp_path / "slots" / "checkpoint" / "meta.json").touch()
     for name, value in (("read_stage", done), ("require_parents", None), ("require_config", None)):
