@@ -149,6 +149,13 @@ class Contents:
         named = {self.video_file(camera, episode.row) for episode in self.episodes}
         return {path for path in named if path is not None and self.holds(path)}
 
+    @cached_property
+    def listing(self) -> list[tuple[str, int, int]]:
+        """Name, size and time of each file, sorted."""
+        paths = {path for folder in ("meta", "data", "videos") for path in (self.root / folder).rglob("*")}
+        there = ((path, path.stat()) for path in paths.union(*map(self.named_videos, self.videos)) if path.is_file())
+        return sorted((str(path.relative_to(self.root)), stat.st_size, stat.st_mtime_ns) for path, stat in there)
+
     def video_times(self, camera: str, row: dict[str, Any]) -> tuple[float, float] | None:
         """From where to where an episode lies in its video, seconds, or None where its row says no such thing."""
         times = [row.get(f"videos/{camera}/{side}_timestamp") for side in ("from", "to")]

@@ -60,13 +60,7 @@ def episode_origins(files: Contents, actions: Array | None, cache: Path) -> npt.
 
 def _noted(files: Contents, what: str, cache: Path, make: Callable[[], Any]) -> Any:
     """What is made of a data set, remembered by the names, sizes and times of its files: reading videos is slow."""
-    paths = {path for folder in ("meta", "data", "videos") for path in (files.root / folder).rglob("*")}
-    listing = sorted(
-        (str(path.relative_to(files.root)), path.stat().st_size, path.stat().st_mtime_ns)
-        for path in paths.union(*map(files.named_videos, files.videos))
-        if path.is_file()
-    )
-    key = hashlib.sha256(json.dumps([str(files.root.resolve()), what, listing]).encode()).hexdigest()[:32]
+    key = hashlib.sha256(json.dumps([str(files.root.resolve()), what, files.listing]).encode()).hexdigest()[:32]
     note = cache / "fingerprints" / f"{key}.json"
     if note.is_file():
         return json.loads(note.read_text())["fingerprint"]

@@ -7,6 +7,8 @@ those are told here alone, by where a set lies, however its name is written.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +44,13 @@ def open_videos(config: ExperimentConfig, roots: str, what: str, whole: bool = T
     data = config.data
     here, shown = {*places(roots)}, {*places(data.demos or roots)}
     cut = bool(data.held_out and here & shown and not (whole and here <= shown))
-    held = _held_out(config, data.demos or roots) if cut else {}
+    opened = functools.cache(functools.partial(open_configured, config))
+    held = _held_out(config, data.demos or roots, opened) if cut else {}
     if not any(len(held.get(name, ())) for name in here):
         source = open_configured(config, roots)
         return split_tested(source, data.tested)[0] if data.tested else source
     named = data_roots(roots)
-    parts = [open_configured(config, root.path) for root in named]
+    parts = [opened(root.path) for root in named]
     out = [held.get(place(root.path), np.zeros(0, np.int64)) for root in named]
     if data.tested:
         before = np.cumsum([0, *(part.recordings for part in parts)])
@@ -66,10 +69,10 @@ def open_videos(config: ExperimentConfig, roots: str, what: str, whole: bool = T
     return weighted([part for part, _ in left], [weight for _, weight in left])
 
 
-def _held_out(config: ExperimentConfig, roots: str) -> dict[str, IntArray]:
+def _held_out(config: ExperimentConfig, roots: str, opened: Callable[[str], EpisodeFrames]) -> dict[str, IntArray]:
     """Numbers of the held-out episodes of each set of demonstrations, by its place; a DataError where all would be."""
     paths, data = [root.path for root in data_roots(roots)], config.data
-    counts = [open_configured(config, path).recordings for path in paths]
+    counts = [opened(path).recordings for path in paths]
     total = sum(counts)
     last: IntArray = np.arange(free_demonstrations(total, data.held_out), total)
     if data.tested:  # the last of all, too: who measures may not know of the test

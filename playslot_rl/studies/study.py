@@ -206,6 +206,7 @@ class Study[J: Job]:
 
     def __init__(self, measure: Measure[J], jobs: Mapping[J, Record], began: float) -> None:
         self._measure, self._jobs, self._began = measure, jobs, began
+        self._own = set[J]()  # done, and seen to have their own result: looking takes longer than reading a status
         self._out = Path(measure.config.out)
         self._spent = float(json_or_nothing(self._out / f"{measure.name}.json").get("seconds", 0.0))
 
@@ -244,7 +245,11 @@ class Study[J: Job]:
     def _status(self, job: J) -> launch.Status:
         record = self._jobs[job]
         status = launch.read_status(job.file, record["fingerprint"])
-        return status if status.status != "done" or self._measure.agrees(record) else launch.Status()
+        if status.status == "done" and job not in self._own:
+            if not self._measure.agrees(record):
+                return launch.Status()
+            self._own.add(job)
+        return status
 
     def _ended(self, job: J) -> None:
         status = self._status(job)

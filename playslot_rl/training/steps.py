@@ -124,6 +124,7 @@ class Steps:
         self.name, self.key, self.batches, self.stage = name, key, batches, batches.stage
         self.optimizer, self.config, self.seed, self.device = optimizer, config, seed, torch.device(device)
         self.on_gpu = self.device.type == "cuda"
+        self._separate = isinstance(self.stage, SeparateStage) and self.stage.separate
         self.captures = self._captures()
         self._tapes = [_Tape(share, seed) for share in batches.shares]
         self._replay: Callable[[], None] | None = None
@@ -179,8 +180,7 @@ class Steps:
 
     def _stepped(self, losses: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Clip, look whether all is finite, and let Adam step where it is."""
-        separate = isinstance(self.stage, SeparateStage) and self.stage.separate
-        norm = clip_gradients(self.batches.parameters, self.config.optim.grad_clip, separate=separate)
+        norm = clip_gradients(self.batches.parameters, self.config.optim.grad_clip, separate=self._separate)
         found = torch.stack([self._number, losses["loss"].detach().float(), norm.detach().float()])
         bad = ~found.isfinite().all()
         self._trouble.copy_(torch.where(bad & (self._trouble[0] < 0), found, self._trouble))
