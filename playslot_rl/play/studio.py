@@ -95,5 +95,5 @@ class Studio:
         return found
 
     def close(self) -> None:
-        """End the worker when it has finished what it does."""
-        self._worker.shutdown(wait=True, cancel_futures=True)
+        """End the worker when it has finished what it was given: pages that were closed have their simulators there."""
+        self._worker.shutdown(wait=True)

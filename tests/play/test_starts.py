@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.errors import DataError
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.starts import RecordedStarts, SimulatedStarts, picture_start
+from playslot_rl.play.studio import Studio
 from playslot_rl.world_model import Agent
 
 
@@ -92,4 +94,13 @@ def test_simulators_are_closed_with_their_starts(agent: Agent, simulated: Simula
     session.begin(simulated.start(1))
     assert DotTask.open_tasks == before + 1
     session.close()
+    assert DotTask.open_tasks == before
+
+
+def test_a_page_that_closes_while_the_worker_is_busy_frees_its_simulator(studio: Studio) -> None:
+    before, session = DotTask.open_tasks, studio.session()
+    studio.call(lambda: session.begin(studio.start("simulated"))).result()
+    studio.call(lambda: time.sleep(0.2))
+    studio.call(session.close)
+    studio.close()
     assert DotTask.open_tasks == before
