@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl import keys
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
-from playslot_rl.config.families import FAMILIES, OGBENCH, member
+from playslot_rl.config.families import FAMILIES, OGBENCH, member, own_camera
 from playslot_rl.config.metaworld import NAME as METAWORLD
+from playslot_rl.config.metaworld import NEAR
 from playslot_rl.config.plain import nearest
 from playslot_rl.config.tasks import TASKS
 from playslot_rl.errors import ConfigError
@@ -80,7 +81,7 @@ def family_config(name: str, task: str = "") -> EnvConfig:
         made = EnvConfig(name, warmup_steps=0, task=task or FAMILIES[name].default, **own)
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    return replace(made, max_steps=member(name, made.task).steps)
+    return replace(made, max_steps=member(name, made.task).steps, camera=own_camera(name, made.task))
 
 
 def play_config(env: EnvConfig) -> EnvConfig:
@@ -241,13 +242,13 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
     _check_variation(env)
     if expert and not getattr(creator, "has_expert", True):
         raise without_expert(env)
+    if env.camera not in ("", NEAR):
+        _without_renderer(env).close()
     if env.name == GYM.name:
         from playslot_rl.envs import gym_task
 
         if expert:
             gym_task.check_expert(env)
-        elif env.camera:
-            gym_task.GymTask(env).close()
         if success:
             gym_task.require_success(env)
 

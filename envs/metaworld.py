@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.config.families import member, task_name
-from playslot_rl.config.metaworld import VERSION
+from playslot_rl.config.metaworld import NEAR, VERSION
+from playslot_rl.envs.gym_scene import view
 from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, Frame, PixelTask
 from playslot_rl.envs.rendering import Camera, FrameRenderer, import_mujoco
 
@@ -29,6 +30,8 @@ CAMERAS: Final[dict[str, Camera]] = {
     **dict.fromkeys(("door-close", "shelf-place", "stick-pull", "stick-push", "sweep"), WIDE),
 }
 """Of the tasks whose object the arm hides from `CAMERA`, or whose goal that cuts off."""
+CLOSE: Final = Camera(distance=0.8, azimuth=180.0, elevation=-35.0, lookat=(0.0, 0.68, 0.12))
+"""`env.camera=near`: across the table, where the arm stands beside the things, from two thirds as far."""
 HELD: Final = ("button-press", "assembly", "disassemble", "handle-pull", "pick-out-of-hole", "pick-place-wall")
 """Tasks whose expert's first action is held for the agent step: ButtonPress, as ever, and where that is quicker."""
 LATE: Final = ("dial-turn", "peg-unplug-side", "window-close", "window-open")
@@ -90,11 +93,18 @@ class MetaWorldEnv(PixelTask):
         policies: dict[str, Any] = ENV_POLICY_MAP
         self._expert = policies[task + VERSION]()
         self._held, self._late = task in HELD, task in LATE
-        model, camera = self._simulation.model, CAMERAS.get(task, CAMERA)
-        self.distance_seen = camera.distance
+        model, camera = self._simulation.model, self._camera(task)
+        self.distance_seen = float(getattr(camera, "distance", model.stat.extent / 2))
         self._make_renderer = partial(FrameRenderer, model, camera, self.config.image_size, render or RenderConfig())
         self._moved = [(table, table.copy()) for table in (model.body_pos, model.body_quat, model.site_pos)]
         self._full: npt.NDArray[np.float64] = np.zeros(0)
+
+    def _camera(self, task: str) -> Any:
+        if self.config.camera == NEAR:
+            return CLOSE
+        if self.config.camera:
+            return view(self._simulation, self._simulation.model, self.config.camera)[0]
+        return CAMERAS.get(task, CAMERA)
 
     def _begin(self, rng: np.random.Generator) -> None:
         """Meta-World's reset done once, where that is the same: its own runs the hand's 50 settling steps twice."""

@@ -153,7 +153,8 @@ class EnvConfig(Checked):
         blocks: settings of the `block_*` environments.
         variation: what changes in the picture and not in the task.
         id: of `env=gym`: a registered Gymnasium environment, `FetchReach-v4`, or `package:Id` after importing one.
-        camera: of `env=gym` with MuJoCo: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty is its own.
+        camera: of `env=gym` with MuJoCo, and `metaworld`: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty
+            is its own. Meta-World's tasks with small things have `near`.
         expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
             to its action.
         success: of `env=gym`: the entry of its info that says success; empty is `is_success` or `success`.
@@ -200,11 +201,15 @@ class EnvConfig(Checked):
 
     def serves(self, env: EnvConfig) -> bool:
         """Whether a world model of this task is one of another, too: the same, or one of several."""
-        return env.typed == self.typed or (env.name == self.name and env.task in self.tasks)
+        one = env.name == self.name and env.task in self.tasks
+        return env.typed == self.typed or (one and env.camera == metaworld.seen_by(env.task, self.camera))
 
     def of_episode(self, seed: int) -> EnvConfig:
         """The task of several whose an episode is: each in turn by the seed; else itself."""
-        return replace(self, task=self.tasks[in_turn(seed, len(self.tasks))]) if self.tasks else self
+        if not self.tasks:
+            return self
+        task = self.tasks[in_turn(seed, len(self.tasks))]
+        return replace(self, task=task, camera=metaworld.seen_by(task, self.camera))
 
     def every(self, stride: int) -> EnvConfig:
         """The task as a policy of every `stride`-th frame acts in it: its steps are so many times longer, and fewer."""
@@ -225,17 +230,23 @@ class EnvConfig(Checked):
     @property
     def typed(self) -> list[str]:
         """The arguments that choose it."""
-        return [f"env={self.name}", *(f"env.{key}={own}" for key in ("task", "id") if (own := getattr(self, key)))]
+        own = {key: getattr(self, key) for key in ("task", "id", "camera")}
+        return [f"env={self.name}", *(f"env.{key}={value}" for key, value in own.items() if value)]
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for key in ("id", "camera", "expert", "success"):
+        for key in ("id", "expert", "success"):
             value = getattr(self, key)
             check(self.name == "gym" or not value, f"env.{key}", value, f"none with env={self.name}: it is of env=gym")
+        seen = self.name in ("gym", metaworld.NAME) or not self.camera
+        check(seen, "env.camera", self.camera, f"none with env={self.name}: it is of env=gym and env={metaworld.NAME}")
         drawn = self.name not in ("grid_shapes", "sketchy", "video") or not self.variation.on
         check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
         if self.name in FAMILIES:
             object.__setattr__(self, "task", task_name(self.name, self.task))
+            near = self.camera != metaworld.NEAR or metaworld.has_small(self.task)
+            small = ", ".join(metaworld.SMALL)
+            check(near, "env.camera", self.camera, f"none with env.task={self.task}: it is of {small}")
         else:
             known = ", ".join(f"env={name}" for name in FAMILIES)
             check(not self.task, "env.task", self.task, f"none with env.name={self.name}: it is for {known}")

@@ -71,9 +71,15 @@ def member(env: str, task: str) -> Member:
     return FAMILIES[env].tasks[name] if env == OGBENCH else metaworld.member(name)
 
 
+def own_camera(env: str, task: str) -> str:
+    """`env.camera` of who types none."""
+    return metaworld.NEAR if env == metaworld.NAME and metaworld.has_small(task_name(env, task)) else ""
+
+
 def preset_values(env: Mapping[str, Any], preset: str, rollout: int, brought: Collection[str]) -> dict[str, Any]:
-    """What a task changes in a preset whose dynamics predict `rollout` frames: the length of its episodes, and of all
-    that is as long as they are. No preset knows `env=gym` and tasks that are `brought`: `env` says how long theirs are.
+    """What a task changes in a preset whose dynamics predict `rollout` frames: its camera, the length of its episodes,
+    and of all that is as long as they are. No preset knows `env=gym` and tasks that are `brought`: `env` says how long
+    theirs are.
     """
     if env["name"] in FAMILIES:
         try:
@@ -86,10 +92,11 @@ def preset_values(env: Mapping[str, Any], preset: str, rollout: int, brought: Co
         rollout = max(1, min(rollout, steps - 2))
     else:
         return {}
+    own = {"camera": camera} if (camera := own_camera(env["name"], env.get("task") or "")) else {}
     if preset == "smoke":
-        return {}
+        return {"env": own}
     return {
-        "env": {"max_steps": steps},
+        "env": {"max_steps": steps, **own},
         "collect": {"random_steps": steps, "expert_steps": steps},
         "model": {"predictor": {"context": steps + 4}},  # past it imagination evicts frames and falls apart
         "dynamics": {"predicted_frames": rollout},

@@ -84,6 +84,13 @@ SETS: Final[dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Several tasks under one name, in Meta-World's order: which of them an episode is follows from its seed."""
 
+NEAR: Final = "near"
+"""The camera of `SMALL` tasks, and of sets with some."""
+SMALL: Final = (
+    "reach", "reach-wall", "push", "push-back", "push-wall", "pick-place", "pick-place-wall", "sweep-into", "soccer",
+)  # fmt: skip
+"""Tasks on the open table, whose things have less than ten pixels, or whose goals, from where the others are seen."""
+
 JOINT: Final = "+"
 """Between the names of tasks that make a set."""
 
@@ -91,6 +98,16 @@ JOINT: Final = "+"
 def several(task: str) -> tuple[str, ...]:
     """The tasks of a set, by its name or theirs (`reach+push`); empty of one task."""
     return SETS.get(task, tuple(task.split(JOINT)) if JOINT in task else ())
+
+
+def has_small(task: str) -> bool:
+    """Whether it is of `SMALL`, or a set with some."""
+    return any(name in SMALL for name in several(task) or (task,))
+
+
+def seen_by(task: str, camera: str) -> str:
+    """The camera of a task whose set has `camera`."""
+    return "" if camera == NEAR and not has_small(task) else camera
 
 
 def member(task: str) -> Member:
