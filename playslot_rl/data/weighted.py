@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig, metaworld
 from playslot_rl.config.weights import DataRoot, data_roots
 from playslot_rl.data.cache import Cache
+from playslot_rl.data.metadata import read_record
 from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.data.views import IntArray, concatenate, every, text_hash
 from playslot_rl.errors import DataError
@@ -92,13 +93,26 @@ def draw_episodes(
     return order[position].astype(np.int64), offset.astype(np.int64)
 
 
+def _require_view(env: EnvConfig, root: str) -> None:
+    """Refuse frames of the task that our collectors recorded by another camera than `env.camera`, by a DataError."""
+    record = read_record(Path(root).expanduser()) or {}
+    for entry in (record, *(record.get("sources") or ())):
+        seen = (entry.get("spec") or {}).get("env") or {}
+        got, expected = seen.get("camera", ""), metaworld.seen_by(str(seen.get("task", "")), env.camera)
+        if seen.get("name") == env.name and got != expected:
+            raise DataError(
+                f"{root}: got frames recorded with env.camera={got}, expected env.camera={expected}: record them anew, "
+                f"or set env.camera={got} here and wherever the model acts"
+            )
+
+
 def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:
     """One or several data sets as one, by `env.image_size` and what `data` says of cameras, caches, size and stride.
 
     `roots` are folders, or a text with commas and weights (`playslot_rl.config.weights`).
 
     Raises:
-        DataError: as `open_sources`; or the sets do not agree.
+        DataError: as `open_sources`; or the sets do not agree, or our collectors recorded one by another camera.
         ConfigError: a weight that is not above 0.
     """
     named = data_roots(roots) if isinstance(roots, str) else [DataRoot(str(root), None) for root in roots]
@@ -107,6 +121,8 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         return weighted(parts, [root.weight for root in named])
     data, size = config.data, config.env.image_size
     paths = [root.path for root in named]
+    for path in paths:
+        _require_view(config.env, path)
     buffer = data.shuffle_buffer if data.stream else None
     source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
     return every(source, data.stride, data.stride_action)

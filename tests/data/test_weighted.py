@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from playslot_rl.config import DataConfig
+from playslot_rl.config import DataConfig, EnvConfig
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
@@ -174,3 +177,26 @@ def test_slots_are_parsed_once_for_each_set_whatever_the_weights(
         slots = slot_cache(source, savi, "f" * 16, tmp_path)
         assert len(slots) == sum(SMALL) + sum(LARGE)
         assert np.array_equal(slots[np.array([[0, 7], [126, 6]])], np.concatenate(parts)[[[0, 7], [126, 6]]])
+
+
+@pytest.mark.parametrize(
+    ("recorded", "asked", "message"),
+    [
+        ({"task": "reach"}, {"task": "reach", "camera": "near"}, "recorded with env.camera=, expected env.camera=near"),
+        ({"task": "push", "camera": "near"}, {"task": "push"}, "recorded with env.camera=near, expected env.camera="),
+        ({"task": "drawer-open"}, {"task": "reach+drawer-open", "camera": "near"}, ""),
+        ({"task": "reach", "camera": "near"}, {"task": "reach+drawer-open", "camera": "near"}, ""),
+    ],
+)
+@pytest.mark.parametrize("merged", [False, True])
+def test_frames_of_another_view_of_the_task_are_refused(
+    foreign_images: Path, tmp_path: Path, recorded: dict[str, str], asked: dict[str, str], message: str, merged: bool
+) -> None:
+    root = shutil.copytree(foreign_images, tmp_path / "set")
+    note = {"spec": {"env": {"name": "metaworld", **recorded}}}
+    record = {"episodes": [], **({"sources": [{"name": "a"}, note]} if merged else note)}
+    (root / "meta/playslot.json").write_text(json.dumps(record))
+    config = replace(tiny_config(), data=DataConfig(cache=str(tmp_path / "cache"), resize=True))
+    config = replace(config, env=EnvConfig("metaworld", image_size=32, **asked))  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=re.escape(message)) if message else contextlib.nullcontext():
+        open_configured(config, str(root))

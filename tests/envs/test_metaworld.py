@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from playslot_rl import keys
 from playslot_rl.config import EnvConfig, to_dict
 from playslot_rl.config.compose import compose, spelled
-from playslot_rl.config.metaworld import TASKS
+from playslot_rl.config.metaworld import NEAR, SMALL, TASKS
 from playslot_rl.envs import make_env, task_config
 from playslot_rl.envs.metaworld import CAMERAS, LATE, MetaWorldEnv
 from playslot_rl.errors import ConfigError
@@ -110,6 +111,41 @@ def test_a_goal_is_drawn_where_it_is(reach: MetaWorldEnv) -> None:
     assert np.ptp(places, axis=0).max() > 0.02
 
 
+def pixels(env: MetaWorldEnv) -> dict[str, int]:
+    """What a goal and a loose thing have of eight first frames, the median."""
+    names = [name for (name, *_) in env.objects()]
+    seen = [name for name in ("goal", "obj", "soccer_ball", "goal_whole") if name in names]
+    counts: list[list[int]] = []
+    for seed in range(8):
+        env.reset(seed=seed)
+        labels = env.segment()
+        counts.append([int((labels == 1 + names.index(name)).sum()) for name in seen])
+    env.close()
+    return dict(zip(seen, np.median(counts, axis=0).tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    "task", ["push", *(pytest.param(task, marks=pytest.mark.slow) for task in SMALL if task != "push")]
+)
+def test_small_things_have_more_pixels_from_near(task: str) -> None:
+    config = task_config(f"metaworld/{task}")
+    assert config.camera == NEAR
+    near, far = (pixels(MetaWorldEnv(replace(config, camera=camera))) for camera in (NEAR, ""))
+    assert max(far.values()) < max(near.values())
+    for name, count in near.items():
+        assert count >= 1.6 * far[name] or (task == "soccer" and name == "goal"), "a marker in the net"
+
+
+def test_a_camera_may_be_named_or_typed() -> None:
+    shown = []
+    for camera in ("", "corner2", "1.25,145,-40,-0.05,0.75,0"):
+        env = make_env(EnvConfig("metaworld", task="drawer-open", camera=camera))
+        shown.append(env.reset(seed=5)[0][keys.PIXELS])
+        env.close()
+    np.testing.assert_array_equal(shown[0], shown[2])
+    assert not np.array_equal(shown[0], shown[1])
+
+
 @pytest.mark.integration
 def test_button_press_is_one_of_them() -> None:
     frames = []
@@ -134,6 +170,11 @@ def test_the_names_are_metaworlds_own() -> None:
     [
         (("env=metaworld", "env.task=drawr-opn"), "did you mean drawer-open or drawer-close or door-open"),
         (("env=metaworld", "env.task="), "env.task: got '', expected one of Meta-World's 51"),
+        (
+            ("env=metaworld", "env.camera=near"),
+            "env.camera: got 'near', expected none with env.task=drawer-open",
+        ),
+        (("env.camera=near",), "env.camera: got 'near', expected none with env=button_press"),
         (("env.task=drawer-open",), "env.task: got 'drawer-open', expected none with env.name=button_press"),
     ],
 )

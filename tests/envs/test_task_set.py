@@ -11,7 +11,7 @@ import pytest
 
 from playslot_rl import keys
 from playslot_rl.config.compose import compose
-from playslot_rl.config.metaworld import SETS, TASKS
+from playslot_rl.config.metaworld import SETS, SMALL, TASKS
 from playslot_rl.envs import make_env, task_config
 from playslot_rl.envs.task_set import TaskSet
 from playslot_rl.errors import ConfigError
@@ -38,6 +38,18 @@ def test_episodes_take_the_tasks_in_turn() -> None:
     assert [config.of_episode(seed).task for seed in range(30, 50)] == [*MT10, *MT10]
     assert len({*config.sentences}) == len(MT10), "data sets tell them apart by their words"
     assert task_config("metaworld/reach").of_episode(7) == task_config("metaworld/reach")
+
+
+def test_its_small_tasks_are_seen_from_near() -> None:
+    config = task_config("metaworld/MT10")
+    seen = {name: config.of_episode(seed).camera for seed, name in enumerate(MT10)}
+    assert {name for name, camera in seen.items() if camera} == {"reach", "push", "pick-place"}
+    before = replace(config, camera="")  # a world model of before
+    for name in MT10:
+        alone = task_config(f"metaworld/{name}")
+        assert config.serves(alone)
+        assert before.serves(alone) == (name not in SMALL)
+        assert before.serves(replace(alone, camera=""))
 
 
 def test_it_lasts_as_long_as_its_longest_task() -> None:
