@@ -167,8 +167,8 @@ def views_of_one(views: Sequence[EpisodeFrames]) -> EpisodeFrames:
 
 
 def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
-    """Refuse, by a DataError, one set twice, sets of other frame sizes or rates, with `weights` of other robots or
-    widths of actions, too; what else is not as in the first is said."""
+    """Refuse, by a DataError, one set twice, sets of other frame sizes or rates, or with the same actions in another
+    order, with `weights` of other robots or widths of actions, too; what else is not as in the first is said."""
     first = sources[0]
     known = {(first.fingerprint, first.camera)}
     for source in sources[1:]:
@@ -188,6 +188,12 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
                 raise DataError(f"{said}: read sets of one kind")
             if got != want:
                 say_once(f"note: {said}: {cure}")
+        names, known_names = (() if each.limits is None else each.limits.names for each in (source, first))
+        if names != known_names and sorted(names) == sorted(known_names):
+            raise DataError(
+                f"{source.name}: got actions in the order {', '.join(names)}, expected {', '.join(known_names)} as in "
+                f"{first.name}: record them in one order"
+            )
         if (source.fingerprint, source.camera) in known:
             raise DataError(
                 f"{source.name}: got the frames of {source.camera} twice, expected each recording once: leave one out "

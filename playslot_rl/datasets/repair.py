@@ -63,6 +63,8 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
         OutputError: `out` exists, another command repairs in the same place, or the disk is full.
     """
     folder = Path(root)
+    if folder.name in ("", ".."):  # names are put beside it
+        folder = folder.resolve()
     if out is not None:
         require_free(Path(out), "--out ")
         return _repair(folder, Path(out))

@@ -77,7 +77,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         OutputError: the file lies in a data set, or cannot be written.
     """
     contents = require_sound(root)
-    target = Path(out) if out is not None else contents.root.with_name(f"{contents.root.absolute().name}.html")
+    target = Path(out) if out is not None else (here := contents.root.resolve()).with_name(f"{here.name}.html")
     require_outside(target, [contents.root], "--out ", "file")
     chosen = spread(len(contents.spans), episodes)
     summary = info(root)

@@ -59,7 +59,8 @@ def ways_of_acting(
     """The rows of a table: random actions and the latent policy (unless `evaluation.references` is false), then each
     planner with each proposal. A ConfigError for a planner that the world model cannot serve.
     """
-    plan, size = config.plan, search_size(config.plan, protocol, config.acting.frame_skip)
+    plan, steps = config.plan, max(config.acting.max_steps, round(config.plan.budget / config.acting.frame_skip))
+    size = search_size(config.plan, protocol, config.acting.frame_skip)
     images = {goal.seed: goal.image for goal in goals}
 
     def image_of(seeds: Sequence[int]) -> Tensor:
@@ -67,7 +68,7 @@ def ways_of_acting(
 
     actors: dict[str, Actor] = {}
     if config.evaluation.references:
-        actors["random"] = RandomActor(config.acting.max_steps, config.acting.action_dim)
+        actors["random"] = RandomActor(steps, config.acting.action_dim)
         actors["policy"] = playslot_actor(agent)
     for name in plan.planner:
         planner = build_planner(name, plan, size, agent.world_model)

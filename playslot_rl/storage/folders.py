@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import shutil
 from collections.abc import Iterable, Iterator
@@ -113,9 +114,11 @@ def held(folder: Path) -> Iterator[bool]:
         os.close(handle)
 
 
-def remove_leftovers(final: Path) -> None:
-    """Remove what processes that were killed while they made `final` have left; its name may be a pattern."""
-    for leftover in final.parent.glob(f".{final.name}.tmp-*"):
+def remove_leftovers(final: Path, pattern: str = "") -> None:
+    """Remove what processes that were killed while they made `final`, or all that have names of a `pattern` beside it,
+    have left.
+    """
+    for leftover in final.parent.glob(f".{pattern or glob.escape(final.name)}.tmp-*"):
         with contextlib.suppress(OSError), held(leftover) as free:
             if free:
                 shutil.rmtree(leftover, ignore_errors=True)

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from playslot_rl.config import DataConfig, EnvConfig
+from playslot_rl.data.action_limits import ActionLimits
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
@@ -200,3 +201,16 @@ def test_frames_of_another_view_of_the_task_are_refused(
     config = replace(config, env=EnvConfig("metaworld", image_size=32, **asked))  # type: ignore[arg-type]
     with pytest.raises(DataError, match=re.escape(message)) if message else contextlib.nullcontext():
         open_configured(config, str(root))
+
+
+@pytest.mark.parametrize("order", [("pan", "lift"), ("lift", "pan"), ("x", "y")])
+def test_columns_of_the_same_names_in_another_order_are_refused(order: tuple[str, str]) -> None:
+    one = np.ones(2, np.float32)
+    sets = [
+        a_set(i, [4], limits=ActionLimits(names, -one, one, -one, one), name=f"set{i}")
+        for i, names in enumerate((("pan", "lift"), order))
+    ]
+    wrong = order == ("lift", "pan")
+    expected = "set1: got actions in the order lift, pan, expected pan, lift as in set0"
+    with pytest.raises(DataError, match=expected) if wrong else contextlib.nullcontext():
+        concatenate(sets)

@@ -13,6 +13,7 @@ from playslot_rl import keys
 from playslot_rl.data.contents import read_contents
 from playslot_rl.data.places import Problems
 from playslot_rl.datasets import viz
+from playslot_rl.datasets.repair import repair
 from playslot_rl.visualization.charts import LIGHT, curve_figure, figure_bytes
 
 pytestmark = pytest.mark.integration
@@ -77,3 +78,13 @@ def test_names_with_dollar_signs_are_names(images: Path, tmp_path: Path) -> None
     text = viz.write_page(root, tmp_path / "page.html").read_text()
     assert CAMERA in text
     assert "<b>" not in text.partition("<body")[2].replace("<b>fact", "")
+
+
+def test_the_set_one_stands_in_can_be_named_by_a_dot(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(shutil.copytree(images, tmp_path / "set"))
+    assert viz.write_page(".", None) == tmp_path / "set.html"
+    assert repair(".").stated is None
+    (tmp_path / "set/meta/stats.json").unlink()
+    assert repair(".").root == tmp_path / "set"

@@ -14,8 +14,8 @@ from playslot_rl.config import PlanConfig, RenderConfig
 from playslot_rl.config.env import EnvConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.goals import GoalPool, distance, make_goals
-from playslot_rl.evaluation.planning import cost_along_solution, play, results, shape
-from playslot_rl.testing import tiny_agent
+from playslot_rl.evaluation.planning import cost_along_solution, play, results, shape, ways_of_acting
+from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.visualization.document import to_markdown
 from playslot_rl.visualization.planning_page import planning_page
 
@@ -66,6 +66,14 @@ def test_no_goal_at_all_is_refused(pool: GoalPool) -> None:
     with pytest.raises(ConfigError, match=r"plan\.goals=solved: got no goal"):
         make_goals(pool, SEEDS[:1], "solved", PlanConfig(), 0)
     pool.env = ENV
+
+
+def test_random_actions_last_as_long_as_the_budget() -> None:
+    config, agent = tiny_config(), tiny_agent()
+    config = replace(config, env=ENV, plan=PlanConfig(planner=("cem",), budget=20 * ENV.frame_skip * ENV.max_steps))
+    random = ways_of_acting(config, agent, "ahead", [])["random"]
+    assert isinstance(random, RandomActor)
+    assert random.steps == 20 * ENV.max_steps
 
 
 def test_curves_are_told_by_their_end_their_slope_and_their_top() -> None:

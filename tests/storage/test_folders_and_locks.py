@@ -16,14 +16,15 @@ from playslot_rl.storage.folders import new_folder
 from playslot_rl.storage.locks import locked
 
 
-def test_a_folder_appears_whole_and_leftovers_of_a_kill_go(tmp_path: Path) -> None:
-    final = tmp_path / "deep" / "made"
-    (final.parent / ".made.tmp-0123456789ab").mkdir(parents=True)
+@pytest.mark.parametrize("name", ["made", "k[1]", "a*"])
+def test_a_folder_appears_whole_and_leftovers_of_a_kill_go(tmp_path: Path, name: str) -> None:
+    final = tmp_path / "deep" / name
+    (final.parent / f".{name}.tmp-0123456789ab").mkdir(parents=True)
     with new_folder(final) as temporary:
         (temporary / "file").write_text("whole")
         assert not final.exists()
     assert (final / "file").read_text() == "whole"
-    assert [entry.name for entry in final.parent.iterdir()] == ["made"]
+    assert [entry.name for entry in final.parent.iterdir()] == [name]
 
 
 def test_two_that_make_one_folder_leave_each_other_alone(tmp_path: Path) -> None:
