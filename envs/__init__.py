@@ -242,7 +242,7 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
     _check_variation(env)
     if expert and not getattr(creator, "has_expert", True):
         raise without_expert(env)
-    if env.camera not in ("", NEAR):
+    if env.camera not in ("", NEAR) and not (env.name == GYM.name and expert):  # else it is made below
         _without_renderer(env).close()
     if env.name == GYM.name:
         from playslot_rl.envs import gym_task

@@ -52,6 +52,11 @@ def view(env: Any, model: Any, camera: str) -> tuple[Any, bool]:
     return names[number] or int(number), bool(fixed and model.cam_bodyid[number] == 0)
 
 
+def distance_seen(model: Any, camera: Any) -> float:
+    """Metres from what is seen to where it is seen from: a free camera's own, else about so many."""
+    return float(getattr(camera, "distance", model.stat.extent / 2))
+
+
 def _typed(camera: str, names: list[str]) -> Camera:
     """A free camera by its numbers; a ConfigError where these are none."""
     try:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.envs.gym_facts import SUCCESS, facts, first_steps, flat, open_env, picture
-from playslot_rl.envs.gym_scene import Scene, view
+from playslot_rl.envs.gym_scene import Scene, distance_seen, view
 from playslot_rl.envs.pixel_task import Action, Frame, PixelTask
 from playslot_rl.envs.rendering import FrameRenderer, box_sized
 from playslot_rl.errors import ConfigError, first_line
@@ -153,7 +153,7 @@ class GymTask(PixelTask):
         self._drawn = self._simulation.model
         found, at_rest = view(self._simulation.core, self._drawn, self.config.camera)
         self._view = found if self._view is None else self._view
-        self.distance_seen = float(getattr(self._view, "distance", self._drawn.stat.extent / 2))
+        self.distance_seen = distance_seen(self._drawn, self._view)
         self._make_renderer = partial(
             FrameRenderer, self._drawn, self._view, self.config.image_size, self._render, at_rest=at_rest
         )

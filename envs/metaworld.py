@@ -18,7 +18,7 @@ import numpy.typing as npt
 from playslot_rl.config import EnvConfig, RenderConfig
 from playslot_rl.config.families import member, task_name
 from playslot_rl.config.metaworld import NEAR, VERSION
-from playslot_rl.envs.gym_scene import view
+from playslot_rl.envs.gym_scene import distance_seen, view
 from playslot_rl.envs.pixel_task import ACTION_DIM, STATE_DIM, Action, Frame, PixelTask
 from playslot_rl.envs.rendering import Camera, FrameRenderer, import_mujoco
 
@@ -93,18 +93,19 @@ class MetaWorldEnv(PixelTask):
         policies: dict[str, Any] = ENV_POLICY_MAP
         self._expert = policies[task + VERSION]()
         self._held, self._late = task in HELD, task in LATE
-        model, camera = self._simulation.model, self._camera(task)
-        self.distance_seen = float(getattr(camera, "distance", model.stat.extent / 2))
-        self._make_renderer = partial(FrameRenderer, model, camera, self.config.image_size, render or RenderConfig())
+        model, (camera, at_rest) = self._simulation.model, self._view(task)
+        self.distance_seen = distance_seen(model, camera)
+        self._make_renderer = partial(
+            FrameRenderer, model, camera, self.config.image_size, render or RenderConfig(), at_rest=at_rest
+        )
         self._moved = [(table, table.copy()) for table in (model.body_pos, model.body_quat, model.site_pos)]
         self._full: npt.NDArray[np.float64] = np.zeros(0)
 
-    def _camera(self, task: str) -> Any:
-        if self.config.camera == NEAR:
-            return CLOSE
-        if self.config.camera:
-            return view(self._simulation, self._simulation.model, self.config.camera)[0]
-        return CAMERAS.get(task, CAMERA)
+    def _view(self, task: str) -> tuple[Any, bool]:
+        """What a `FrameRenderer` looks through, and whether it is at rest: the hand carries one of the cameras."""
+        if self.config.camera in ("", NEAR):
+            return CLOSE if self.config.camera else CAMERAS.get(task, CAMERA), True
+        return view(self._simulation, self._simulation.model, self.config.camera)
 
     def _begin(self, rng: np.random.Generator) -> None:
         """Meta-World's reset done once, where that is the same: its own runs the hand's 50 settling steps twice."""

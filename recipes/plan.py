@@ -87,18 +87,18 @@ def _measure(
     """All ways of acting towards one kind of goal: a part of the report."""
     from playslot_rl.evaluation.goals import make_goals
     from playslot_rl.evaluation.held_out import check_disjoint, first_seed, training_seeds
-    from playslot_rl.evaluation.planning import cost_along_solution, play, results, ways_of_acting
+    from playslot_rl.evaluation.planning import cost_along_solution, play, results, steps_to_act, ways_of_acting
     from playslot_rl.storage.atomic import write_bytes, write_json
     from playslot_rl.visualization.charts import LIGHT
     from playslot_rl.visualization.planning_page import solution_chart
 
-    plan, first, whole = config.plan, first_seed(config, config.seed), config.acting.max_steps
+    plan, first = config.plan, first_seed(config, config.seed)
     episodes = make_goals(pool, range(first, first + (config.episodes or EPISODES)), goals, plan, config.seed)
     check_disjoint([episode.seed for episode in episodes], training_seeds(config, Path(common["folder"])))
     solution = cost_along_solution(agent, episodes, plan.looks, plan.match)
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / "cost.png", solution_chart(solution, LIGHT))
-    steps = whole if goals == "solved" else max(2, round(plan.budget / config.acting.frame_skip))
+    steps = steps_to_act(config, goals)
     every, found = common["size"]["every"], {}
     for name, actor in ways_of_acting(config, agent, goals, episodes).items():
         played = play(pool, actor, episodes, goals, steps, every, draw=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final, Literal
 
 from playslot_rl.config import metaworld
-from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS, member, task_name
+from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS, member, own_camera, task_name
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
@@ -201,14 +201,13 @@ class EnvConfig(Checked):
 
     def serves(self, env: EnvConfig) -> bool:
         """Whether a world model of this task is one of another, too: the same, or one of several."""
-        one = env.name == self.name and env.task in self.tasks
-        return env.typed == self.typed or (one and env.camera == metaworld.seen_by(env.task, self.camera))
+        return env.typed in (self.typed, *(self._alone(task).typed for task in self.tasks if task == env.task))
 
     def of_episode(self, seed: int) -> EnvConfig:
         """The task of several whose an episode is: each in turn by the seed; else itself."""
-        if not self.tasks:
-            return self
-        task = self.tasks[in_turn(seed, len(self.tasks))]
+        return self._alone(self.tasks[in_turn(seed, len(self.tasks))]) if self.tasks else self
+
+    def _alone(self, task: str) -> EnvConfig:
         return replace(self, task=task, camera=metaworld.seen_by(task, self.camera))
 
     def every(self, stride: int) -> EnvConfig:
@@ -229,9 +228,10 @@ class EnvConfig(Checked):
 
     @property
     def typed(self) -> list[str]:
-        """The arguments that choose it."""
-        own = {key: getattr(self, key) for key in ("task", "id", "camera")}
-        return [f"env={self.name}", *(f"env.{key}={value}" for key, value in own.items() if value)]
+        """The arguments that choose it; a camera where it is not the one of who types none."""
+        own = [f"env.{key}={value}" for key in ("task", "id") if (value := getattr(self, key))]
+        seen = [] if self.camera == own_camera(self.name, self.task) else [f"env.camera={self.camera}"]
+        return [f"env={self.name}", *own, *seen]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -244,9 +244,8 @@ class EnvConfig(Checked):
         check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
         if self.name in FAMILIES:
             object.__setattr__(self, "task", task_name(self.name, self.task))
-            near = self.camera != metaworld.NEAR or metaworld.has_small(self.task)
-            small = ", ".join(metaworld.SMALL)
-            check(near, "env.camera", self.camera, f"none with env.task={self.task}: it is of {small}")
+            alone, small = metaworld.seen_by(self.task, self.camera), ", ".join(metaworld.SMALL)
+            check(self.camera == alone, "env.camera", self.camera, f"none with env.task={self.task}: it is of {small}")
         else:
             known = ", ".join(f"env={name}" for name in FAMILIES)
             check(not self.task, "env.task", self.task, f"none with env.name={self.name}: it is for {known}")

@@ -92,7 +92,8 @@ def preset_values(env: Mapping[str, Any], preset: str, rollout: int, brought: Co
         rollout = max(1, min(rollout, steps - 2))
     else:
         return {}
-    own = {"camera": camera} if (camera := own_camera(env["name"], env.get("task") or "")) else {}
+    camera = own_camera(env["name"], str(env.get("task", "")))
+    own = {"camera": camera} if camera else {}
     if preset == "smoke":
         return {"env": own}
     return {

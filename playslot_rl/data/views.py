@@ -182,18 +182,15 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
         if source.actions is not None and first.actions is not None:
             widths = source.actions.shape[1], first.actions.shape[1]
             facts.append(("actions of width", *widths, "none are read; leave one out where they count"))
+        names, others = (() if each.limits is None else each.limits.names for each in (source, first))
+        if sorted(names) == sorted(others):
+            facts.append(("actions in the order", ", ".join(names), ", ".join(others), ""))
         for what, got, want, cure in facts:
             said = f"{source.name}: got {what} {got}, expected {want} as in {first.name}"
             if got != want and (weights or not cure):
                 raise DataError(f"{said}: read sets of one kind")
             if got != want:
                 say_once(f"note: {said}: {cure}")
-        names, known_names = (() if each.limits is None else each.limits.names for each in (source, first))
-        if names != known_names and sorted(names) == sorted(known_names):
-            raise DataError(
-                f"{source.name}: got actions in the order {', '.join(names)}, expected {', '.join(known_names)} as in "
-                f"{first.name}: record them in one order"
-            )
         if (source.fingerprint, source.camera) in known:
             raise DataError(
                 f"{source.name}: got the frames of {source.camera} twice, expected each recording once: leave one out "

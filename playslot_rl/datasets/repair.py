@@ -24,7 +24,7 @@ from playslot_rl.datasets.verify import LOOSE_CAMERA, Verification, episode_stat
 from playslot_rl.datasets.video_copy import frame_count, video_place
 from playslot_rl.errors import DataError, OutputError
 from playslot_rl.storage.atomic import explain_write_errors, fsync_folder
-from playslot_rl.storage.folders import held, new_folder, require_free
+from playslot_rl.storage.folders import by_name, held, new_folder, require_free
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,7 @@ def repair(root: str | Path, out: str | Path | None = None) -> RepairResult:
         DataError: there is no whole episode, or no `meta/info.json` to begin with.
         OutputError: `out` exists, another command repairs in the same place, or the disk is full.
     """
-    folder = Path(root)
-    if folder.name in ("", ".."):  # names are put beside it
-        folder = folder.resolve()
+    folder = by_name(Path(root))
     if out is not None:
         require_free(Path(out), "--out ")
         return _repair(folder, Path(out))

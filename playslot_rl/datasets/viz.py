@@ -25,7 +25,7 @@ from playslot_rl.datasets.verify import require_sound
 from playslot_rl.errors import ConfigError
 from playslot_rl.frames import png
 from playslot_rl.storage.atomic import write_text
-from playslot_rl.storage.folders import require_outside
+from playslot_rl.storage.folders import by_name, require_outside
 from playslot_rl.visualization.charts import DARK, LIGHT, curve_figure, figure_bytes
 from playslot_rl.visualization.document import Block, Document, Picture, Section, Table, Text, to_html
 from playslot_rl.visualization.grid import animation, image_grid
@@ -77,7 +77,8 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
         OutputError: the file lies in a data set, or cannot be written.
     """
     contents = require_sound(root)
-    target = Path(out) if out is not None else (here := contents.root.resolve()).with_name(f"{here.name}.html")
+    here = by_name(contents.root)
+    target = Path(out) if out is not None else here.with_name(f"{here.name}.html")
     require_outside(target, [contents.root], "--out ", "file")
     chosen = spread(len(contents.spans), episodes)
     summary = info(root)
@@ -87,7 +88,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     sections = [Section("Data set", [about, features])]
     sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen)]
     lead = f"{summary.episodes} episodes, {summary.frames} frames at {summary.fps:g} fps; shown: {_names(chosen)}."
-    write_text(target, to_html(Document(f"Data set {contents.root.absolute().name}", lead, sections)))
+    write_text(target, to_html(Document(f"Data set {here.name}", lead, sections)))
     return target
 
 

@@ -53,14 +53,20 @@ class Played:
     wall: float = 0.0
 
 
+def steps_to_act(config: ExperimentConfig, goals: GoalName) -> int:
+    """Agent steps that a row has to reach its goal."""
+    if goals == "solved":
+        return config.acting.max_steps
+    return max(2, round(config.plan.budget / config.acting.frame_skip))
+
+
 def ways_of_acting(
     config: ExperimentConfig, agent: Agent, protocol: GoalName, goals: Sequence[GoalEpisode]
 ) -> dict[str, Actor]:
     """The rows of a table: random actions and the latent policy (unless `evaluation.references` is false), then each
     planner with each proposal. A ConfigError for a planner that the world model cannot serve.
     """
-    plan, steps = config.plan, max(config.acting.max_steps, round(config.plan.budget / config.acting.frame_skip))
-    size = search_size(config.plan, protocol, config.acting.frame_skip)
+    plan, size = config.plan, search_size(config.plan, protocol, config.acting.frame_skip)
     images = {goal.seed: goal.image for goal in goals}
 
     def image_of(seeds: Sequence[int]) -> Tensor:
@@ -68,7 +74,7 @@ def ways_of_acting(
 
     actors: dict[str, Actor] = {}
     if config.evaluation.references:
-        actors["random"] = RandomActor(steps, config.acting.action_dim)
+        actors["random"] = RandomActor(steps_to_act(config, protocol), config.acting.action_dim)
         actors["policy"] = playslot_actor(agent)
     for name in plan.planner:
         planner = build_planner(name, plan, size, agent.world_model)

@@ -85,7 +85,7 @@ def new_folder(final: Path, *, replace: bool = False, create: bool = True, key: 
     temporary = temporary_name(final)
     with explain_write_errors(final):
         final.parent.mkdir(parents=True, exist_ok=True)
-        remove_leftovers(final)
+        remove_leftovers(final.parent, glob.escape(final.name))
         if create:
             temporary.mkdir()
         with held(temporary) if create else contextlib.nullcontext():  # no other process takes it for a leftover
@@ -114,11 +114,14 @@ def held(folder: Path) -> Iterator[bool]:
         os.close(handle)
 
 
-def remove_leftovers(final: Path, pattern: str = "") -> None:
-    """Remove what processes that were killed while they made `final`, or all that have names of a `pattern` beside it,
-    have left.
-    """
-    for leftover in final.parent.glob(f".{pattern or glob.escape(final.name)}.tmp-*"):
+def by_name(folder: Path) -> Path:
+    """A folder by its name, which `.` and `..` do not say: others go beside it under names made of it."""
+    return folder.resolve() if folder.name in ("", "..") else folder
+
+
+def remove_leftovers(folder: Path, pattern: str) -> None:
+    """Remove what processes that were killed while they made what a pattern names in a folder have left."""
+    for leftover in folder.glob(f".{pattern}.tmp-*"):
         with contextlib.suppress(OSError), held(leftover) as free:
             if free:
                 shutil.rmtree(leftover, ignore_errors=True)

@@ -173,7 +173,7 @@ class TrainingCheckpoints:
         if self.folder.exists() and not self.folder.is_dir():
             raise OutputError(f"{self.folder} is a file, expected a folder of checkpoints: use another out=")
         # A killed process leaves its unfinished folder; that of one that is writing is left alone.
-        remove_leftovers(self.folder / "step", "step_*")
+        remove_leftovers(self.folder, "step_*")
         last = self.last()
         if last is None:
             return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -144,6 +145,20 @@ def test_a_camera_may_be_named_or_typed() -> None:
         env.close()
     np.testing.assert_array_equal(shown[0], shown[2])
     assert not np.array_equal(shown[0], shown[1])
+
+
+def test_a_camera_that_the_hand_carries_shows_what_is_there() -> None:
+    shown = []
+    for quick in (True, False):
+        env = make_env(EnvConfig("metaworld", task="drawer-open", camera="gripperPOV")).unwrapped
+        assert isinstance(env, MetaWorldEnv)
+        if not quick:
+            env._make_renderer = partial(env._make_renderer, at_rest=False)
+            env.__dict__.pop("_renderer").close()
+        env.reset(seed=3)
+        shown.append([env.step(np.array([0.0, 1.0, -1.0, 0.0], np.float32))[0][keys.PIXELS].copy() for _ in range(6)])
+        env.close()
+    np.testing.assert_array_equal(*shown)
 
 
 @pytest.mark.integration

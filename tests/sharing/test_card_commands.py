@@ -190,6 +190,8 @@ def policy_of(*arguments: str, **source: Any) -> tuple[tuple[str, ...], dict[str
 KINDS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     **{f"pipeline of {env}": policy_of(f"env={env}") for env in ENVIRONMENTS if env != "gym"},
     "pipeline of a Gymnasium environment": policy_of("env=gym", "env.id=FetchReach-v4", "env.camera=1,90,-20,1,1,0"),
+    "another view": policy_of("env=metaworld", "env.task=drawer-open", "env.camera=corner2"),
+    "a view of before": policy_of("env=metaworld", "env.task=reach+push", "env.camera="),
     "shipped world model": policy_of(shipped_world_model=True, recorded={"episodes": 6, "seed": 7}, seed=7),
     "demonstrations of a robot": policy_of(shipped_world_model=True, recorded_elsewhere=True, world_model_seed=3),
     "resized": policy_of("data.resize=true", "env.image_size=32", "model.savi.encoder_strides=[2,2,1]"),
@@ -226,6 +228,7 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
     assert (commands[-1][0], last.out) in (("pipeline", "runs/again"), ("train-policy", "runs/again"))
     assert last.seed == source["seed"]
     assert last.demos == config.demos
+    assert last.env.camera == config.env.camera
     own, got = flatten(to_dict(config)), flatten(to_dict(last))
     free = ("every", "data.root", "data.demos", "start_from", "segmented_episodes")
     for key, value in own.items():
