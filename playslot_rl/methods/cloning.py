@@ -2,7 +2,8 @@
 
     z_t = what the frozen model infers from (o_t, o_{t+1})
     pi(o_t) ~ z_t                       on the videos of all demonstrations, no action read
-    L_a = mean (D(z_t) - a_t)^2         on the labelled ones, D(z_t, h_t) with the policy's features (`decoder_state`)
+    L_a = mean (D(z_t) - a_t)^2         on the labelled ones, D(z_t, h_t) with the policy's features (`decoder_state`),
+                                        which of shifted frames are seen in training as the policy's are
 
 then both together, as PlaySlot's (`training.stage_behaviour`). Policies clone what moves: still transitions are left
 out (`behaviour.trim_pixels`).
@@ -32,7 +33,7 @@ from playslot_rl.data.demonstrations import (
 )
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.views import IntArray
+from playslot_rl.data.views import DIRECTIONS, IntArray, shifted_copies
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.training.demonstrated import cloned, policy_taken_over
@@ -89,6 +90,7 @@ class LatentCloning(ABC):
         loss: Literal["l2", "l1"],
     ) -> None:
         self.config, self.device, self.schedule, self.loss = config, device, schedule, loss
+        self.copies = shifted_copies(demos.trained, shift, len(DIRECTIONS))
         self.trained = self._seen(demos.trained, shift)
         self.labelled = labelled_rows(self.trained.moves.episode, config.behaviour.labelled_demos)
         self.held_out = None if demos.held_out is None else self._seen(demos.held_out)
@@ -149,12 +151,20 @@ class LatentCloning(ABC):
             return JointStage(clone, self.decoder, shown, measured, config)
 
         held_out = None if other is None else self._decided(other, torch.arange(len(other.actions)))
-        demos = self._decided(self.trained, labelled)
-        yield from after_cloning(self.decoder, self.policy, demos, config, part, finetune, held_out)
+        yield from after_cloning(self.decoder, self.policy, self._shown(labelled), config, part, finetune, held_out)
 
     def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:
         moves, frames, actions = moving_examples(self.config, source, self.device, shift)
         return Seen(self.observe(frames), self.infer(source, moves), actions, moves)
+
+    def _shown(self, labelled: Tensor) -> Demonstrations:
+        """The labelled rows, then those of shifted frames."""
+        demos, moved = self._decided(self.trained, labelled), self.trained.moves.rows[labelled.cpu().numpy()]
+        every = torch.arange(len(moved), device=self.device)
+        frames = [FrameInputs(copy, moved, self.device, resident=False) for copy in self.copies]
+        features = [apply_rows(self.policy.features, self.observe(part), every) for part in frames]
+        shown = torch.cat((demos.slots, *features))
+        return replace(demos.take(every.repeat(1 + len(frames))), slots=shown, imagined=shown)
 
     def _decided(self, seen: Seen, rows: Tensor) -> Demonstrations:
         """What the decoder meets of some rows: the policy's features in place of slots."""

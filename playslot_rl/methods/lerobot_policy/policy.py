@@ -5,7 +5,9 @@
 `pre` and `post` are LeRobot's processors: frames by ImageNet's statistics, as `lerobot-train` has it, actions by those
 and, where it is seen, proprioception by those of the labelled demonstrations, stored with the weights.
 
-Note: without proprioception, which LeRobot's Diffusion Policy cannot do without, it is one number that is 0.
+Note: without proprioception, which LeRobot's Diffusion Policy cannot do without, it is one number that is 0. LeRobot
+freezes the BatchNorm layers of ACT's ResNet-18, which without ImageNet's weights are the identity: here they then
+learn.
 
 Shapes: B batch, F frames, H actions of a chunk, E of them executed, A action dim, S proprioception, 0 without.
 """
@@ -84,6 +86,17 @@ class ChunkPolicy(nn.Module):
     def trunk(self) -> tuple[nn.Module, dict[str, str]]:
         """ResNet-18 in it, and torchvision's name of each of its tensors."""
         raise NotImplementedError
+
+    def learn_norms(self) -> None:
+        """Have frozen BatchNorm layers learn, for a ResNet-18 that begins without ImageNet's statistics."""
+        from torchvision.ops import FrozenBatchNorm2d
+
+        for parent in list(self.modules()):
+            for name, child in parent.named_children():
+                if isinstance(child, FrozenBatchNorm2d):
+                    norm = nn.BatchNorm2d(len(child.weight), child.eps, device=child.weight.device)
+                    norm.num_batches_tracked = None  # so that they load into frozen ones, which act alike
+                    setattr(parent, name, norm)
 
     def loss(self, pixels: Tensor, actions: Tensor, pad: Tensor, states: Tensor | None = None) -> Tensor:
         """LeRobot's loss of frames (B, F, 3, W, W), chunks (B, H, A) in [-1, 1], where these are padding (B, H), and

@@ -149,6 +149,8 @@ def training(record: StageRecord, state: bool = False) -> Training:
         policy = chunk_policy(own, config.env.image_size, width, chunk, 0 if states is None else states.shape[1])
     trunk, names = policy.trunk()
     pretraining = load_trunk(trunk, own.weights, f"{group}.weights", names)
+    if pretraining == "scratch":
+        policy.learn_norms()
     policy.give(real_actions(split.trained, moves.rows, width), states)
     policy.to(device)
     trained = chunked(config, split.trained, own, chunk, device, own.shift, state)

@@ -29,7 +29,7 @@ from playslot_rl.methods.lerobot_policy.policy import PAD, ChunkPolicy, chunk_po
 from playslot_rl.methods.lerobot_policy.training import Chunks, _optimizer, chunked
 from playslot_rl.methods.resnet_oracle.network import load_trunk
 from playslot_rl.seeds.draws import derived_seed
-from playslot_rl.storage.tensors import save_tensors
+from playslot_rl.storage.tensors import load_modules, module_tensors, save_tensors
 
 NAMES = ("act", "diffusion")
 LENGTHS = (9, 6)
@@ -227,6 +227,24 @@ def test_a_pretrained_resnet_is_found_by_torchvisions_names(name: str, tmp_path:
     found: Any = trunk.eval()(pixels)
     found = found["feature_map"] if isinstance(found, Mapping) else found
     torch.testing.assert_close(found, seen["out"], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_resnet_from_scratch_learns_its_norms_and_then_acts_as_with_frozen_ones(name: str) -> None:
+    _, _, frozen = made(name)
+    _, _, policy = made(name)
+    policy.learn_norms()
+    trunk, _ = policy.trunk()
+    norms = [part for part in trunk.modules() if "Norm" in type(part).__name__]
+    assert len(norms) == 20
+    assert all(norm.weight.requires_grad for norm in norms)
+    pixels = 0.3 + torch.rand(4, 3, 64, 64)
+    trunk.train()(pixels)
+    assert any(float(norm.running_mean.abs().max()) > 1e-3 for norm in norms)
+    load_modules({"policy": frozen}, module_tensors({"policy": policy}), "")
+    outs: list[Any] = [part.trunk()[0].eval()(pixels) for part in (frozen, policy)]
+    got, wanted = (out["feature_map"] if isinstance(out, Mapping) else out for out in outs)
+    torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(
