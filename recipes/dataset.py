@@ -76,14 +76,21 @@ ACTIONS: Final[dict[str, Action]] = {
     ),
     "split": Action(
         "one data set as several, by episodes",
-        "Deals the episodes out at random, each to exactly one part; frames are copied, not encoded again.",
-        ("playslot dataset split data/all --out data/parts --fractions train=0.9,val=0.1 --seed 1",),
+        "Deals the episodes out at random, each to exactly one part, or without --fractions by their tasks; frames are "
+        "copied, not encoded again.",
+        (
+            "playslot dataset split data/all --out data/parts --fractions train=0.9,val=0.1 --seed 1",
+            "playslot dataset split data/all --out data/tasks",
+        ),
         "playslot_rl.datasets.split:split",
         (
             ROOT,
             _out("folder of the parts, one data set OUT/NAME each"),
             argument(
-                "--fractions", "NAME=SHARE,...", "shares of the episodes, together 1", type=fractions, required=True
+                "--fractions",
+                "NAME=SHARE,...",
+                "shares of the episodes, together 1 (default a part for each task)",
+                type=fractions,
             ),
             argument("--seed", "N", "which episodes go where (default 0)", type=whole(0, LARGEST_DRAW), default=0),
         ),

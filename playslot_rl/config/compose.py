@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import yaml
 
-from playslot_rl.config import ExperimentConfig, from_dict, plugins, to_dict
+from playslot_rl.config import ExperimentConfig, from_dict, metaworld, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.families import preset_values
@@ -350,7 +350,11 @@ def _from_run(run: Path, pairs: Mapping[str, str], play: bool) -> ExperimentConf
     values = to_dict(stored)
     defaults = to_dict(ExperimentConfig())
     values.update({key: defaults[key] for key in keys_of(ExperimentConfig, "call")})
-    config = from_dict(ExperimentConfig, merged(values, _typed(pairs)))
+    typed = _typed(pairs)
+    if stored.env.name == metaworld.NAME:  # one of its tasks may have nothing small to see from near
+        task = str(typed.get("env", {}).get("task", stored.env.task))
+        values["env"]["camera"] = metaworld.seen_by(task, stored.env.camera)
+    config = from_dict(ExperimentConfig, merged(values, typed))
     return config if config.out else dataclasses.replace(config, out=str(run))
 
 

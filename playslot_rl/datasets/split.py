@@ -1,8 +1,9 @@
-"""One data set as several, by episodes: for training and validation."""
+"""One data set as several, by episodes: for training and validation, or one for each task."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,40 +31,63 @@ class SplitResult:
         ]
 
 
-def split(root: str | Path, out: str | Path, fractions: Mapping[str, float], *, seed: int = 0) -> SplitResult:
+def split(
+    root: str | Path, out: str | Path, fractions: Mapping[str, float] | None = None, *, seed: int = 0
+) -> SplitResult:
     """Deal a data set's episodes out to new data sets `out/NAME`; each episode goes to exactly one, none is lost.
 
-    Which episodes go where depends on `seed` alone; within a part they keep their order. Frames are unchanged. A kill
-    leaves no `out`.
+    Which episodes go where depends on `seed` alone, or on their tasks; within a part they keep their order. Frames are
+    unchanged. A kill leaves no `out`.
 
     Args:
-        fractions: name -> share, each more than 0, together 1.
+        fractions: name -> share, each more than 0, together 1; None makes a part of each task, named by its words.
 
     Raises:
         ConfigError: a negative or absurd seed.
-        DataError: a name that is no folder name, shares that do not add up, too few episodes, or a damaged data set.
+        DataError: a name that is no folder name, shares that do not add up, too few episodes, an episode of several
+            tasks, or a damaged data set.
         OutputError: `out` exists, or the disk is full.
     """
     if not 0 <= seed <= LARGEST_DRAW:
         raise ConfigError(f"seed: got {seed}, expected a whole number from 0 to {LARGEST_DRAW}")
     target = Path(out)
-    for name, share in fractions.items():
+    for name, share in (fractions or {}).items():
         if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:
             raise DataError(
                 f"fractions: got {name}={share:g}, expected a plain name and a share of more than 0, at most 1"
             )
-    total = sum(fractions.values())
+    total = 1.0 if fractions is None else sum(fractions.values())
     if abs(total - 1) > 1e-6:
         raise DataError(f"fractions: got a sum of {total:g}, expected 1, as in train=0.9,val=0.1")
     require_free(target, "--out ")
     contents = require_sound(root)
-    parts = draw(len(contents.spans), fractions, seed)
+    if fractions is None:
+        parts = by_task([episode.tasks for episode in contents.episodes], contents.root)
+    else:
+        parts = draw(len(contents.spans), fractions, seed)
     made = {}
     with new_folder(target, key="--out ") as temporary:
         for name, indices in parts.items():
             assemble([choose(contents, indices)], temporary / name, "playslot dataset split")
             made[name] = require_verified(temporary / name, [contents.root])
     return SplitResult(target, {name: tuple(indices) for name, indices in parts.items()}, made)
+
+
+def by_task(tasks: Sequence[Sequence[str]], root: Path) -> dict[str, list[int]]:
+    """Episodes of each task, ascending, by plain names of their words; a DataError where one has several."""
+    parts: dict[str, list[int]] = {}
+    for index, words in enumerate(tasks):
+        if len(words) > 1:
+            raise DataError(
+                f"{root}: got episode {index} of the tasks {', '.join(map(repr, words))}, expected one in each episode "
+                "to split by tasks: split by --fractions"
+            )
+        parts.setdefault(words[0] if words else "", []).append(index)
+    plain = {words: re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:60] or "task" for words in parts}
+    names, taken = list(plain.values()), dict[str, list[int]]()
+    for number, (words, indices) in enumerate(parts.items()):
+        taken[f"{plain[words]}_{number}" if names.count(plain[words]) > 1 else plain[words]] = indices
+    return taken
 
 
 def draw(episodes: int, fractions: Mapping[str, float], seed: int) -> dict[str, list[int]]:

@@ -20,7 +20,7 @@ from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.demonstrations import DemonstrationSplit, split_demonstrations
+from playslot_rl.data.demonstrations import DemonstrationSplit, require_tasks, split_demonstrations
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.videos import open_videos
@@ -118,7 +118,9 @@ class StageRecord:
                 f"data.demos={self.roots}: got weights, expected none: a policy is cloned from every transition of "
                 "its demonstrations alike; leave the weights out"
             )
-        return split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
+        found = split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
+        require_tasks(found.trained, config.env)
+        return found
 
     def seen(self, frames: int) -> dict[str, Any]:
         """For the checkpoint of a stage that sees clips of so many frames: how many episodes there are."""

@@ -231,6 +231,13 @@ def test_a_run_brings_its_config_and_only_typed_keys_change(tmp_path: Path, comm
     assert (config.preset, config.seed, config.dynamics, config.model) == ("smoke", 3, made.dynamics, made.model)
 
 
+def test_a_task_of_several_is_seen_as_they_are_unless_it_has_nothing_small(tmp_path: Path) -> None:
+    run = store(compose(["preset=smoke", "env=metaworld", "env.task=push+drawer-open"]), tmp_path / "run")
+    for task, camera in (("push", "near"), ("drawer-open", "")):
+        assert compose([f"run={run}", f"env.task={task}"], "evaluate").env.camera == camera
+    assert compose([f"run={run}", "env.task=drawer-open", "env.camera=corner"], "evaluate").env.camera == "corner"
+
+
 def test_out_stays_apart_from_the_run_where_it_is_typed(tmp_path: Path) -> None:
     run = store(compose(["preset=smoke"]), tmp_path / "run")
     assert compose([f"run={run}", "out=other"], "train-policy").out == "other"

@@ -17,8 +17,9 @@ from playslot_rl.data.agreement import open_files
 from playslot_rl.data.prints import episode_origins
 from playslot_rl.datasets import merge as merging
 from playslot_rl.datasets.fingerprint import content_fingerprint
+from playslot_rl.datasets.info import info
 from playslot_rl.datasets.merge import merge
-from playslot_rl.datasets.split import draw, split
+from playslot_rl.datasets.split import by_task, draw, split
 from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import DataError, OutputError
 
@@ -192,6 +193,27 @@ def test_a_video_without_key_frames_is_copied_whole(video: Path, tmp_path: Path)
     whole = content_fingerprint(source).episodes
     for name, (index,) in result.episodes.items():
         assert content_fingerprint(tmp_path / "parts" / name).episodes == (whole[index],)
+
+
+@pytest.mark.integration
+def test_without_shares_there_is_a_part_for_each_task(images: Path, other: Path, tmp_path: Path) -> None:
+    both = merge([images, other], tmp_path / "both").out
+    result = split(both, tmp_path / "parts")
+    whole = content_fingerprint(both).episodes
+    assert sorted(i for indices in result.episodes.values() for i in indices) == list(range(len(whole)))
+    tasks = [tuple(info(tmp_path / "parts" / name).tasks) for name in result.episodes]
+    assert sorted(tasks) == sorted((words,) for words in info(both).tasks)
+    for name, indices in result.episodes.items():
+        assert content_fingerprint(tmp_path / "parts" / name).episodes == tuple(whole[i] for i in indices)
+
+
+def test_parts_of_tasks_have_plain_names_and_an_episode_has_one_task() -> None:
+    root = Path("set")
+    tasks = [("Open the drawer!",), ("close it",), ("open the drawer",), ("close it",), ("\u62bd\u5c49",)]
+    parts = by_task(tasks, root)
+    assert parts == {"open-the-drawer_0": [0], "close-it": [1, 3], "open-the-drawer_2": [2], "task": [4]}
+    with pytest.raises(DataError, match="got episode 1 of the tasks 'a', 'b', expected one"):
+        by_task([("a",), ("a", "b")], root)
 
 
 def test_the_draw_depends_on_the_seed_alone_and_adds_up() -> None:

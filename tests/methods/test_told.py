@@ -16,7 +16,7 @@ from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.episodes import Outcome
 from playslot_rl.config import BehaviourStageConfig, EnvConfig, OptimConfig, PolicyConfig
 from playslot_rl.config.metaworld import SETS
-from playslot_rl.data.demonstrations import Demonstrations, told_tasks, transitions
+from playslot_rl.data.demonstrations import Demonstrations, require_tasks, told_tasks, transitions
 from playslot_rl.data.views import concatenate, drawn_demonstrations, episode_range
 from playslot_rl.envs import task_config
 from playslot_rl.errors import ConfigError, DataError
@@ -106,6 +106,17 @@ def test_policy_decoder_and_oracle_learn_what_the_slots_do_not_say(tmp_path: Pat
         assert both.validate(0)["unexplained"] == pytest.approx(float(expected), rel=1e-3)
     assert max(left[2]) < 0.05
     assert min(left[0]) > 0.9
+
+
+def test_who_clones_several_tasks_untold_is_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+    source = replace(videos(32), name="kitchen", tasks=np.array(["Wash up."] * 3 + ["Cook."] * 2 + [""]))
+    require_tasks(source, EnvConfig())
+    told = task_config("metaworld/MT10")
+    require_tasks(replace(source, tasks=np.array(told.sentences[:6])), told)
+    require_tasks(episode_range(source, 3, 6), EnvConfig())  # one, and a silent episode
+    said = capsys.readouterr().err
+    assert said.startswith("note: kitchen: got demonstrations of 2 tasks ('Cook.', 'Wash up.', ...)")
+    assert said.count("\n") == 1
 
 
 def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
