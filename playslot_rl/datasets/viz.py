@@ -6,7 +6,7 @@ Shapes: T frames of an episode, H W frame height and width, A width of a vector.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -86,7 +86,7 @@ def write_page(root: str | Path, out: str | Path | None = None, episodes: int = 
     rows = [[feature_text(name), f"`{name}`", kind] for name, kind in summary.features.items()]
     features = Table(["feature", "name in the data set", "type and shape"], rows)
     sections = [Section("Data set", [about, features])]
-    sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen)]
+    sections += [_episode_section(contents, clip) for clip in _clips(contents, chosen, SHOWN_SIDE)]
     lead = f"{summary.episodes} episodes, {summary.frames} frames at {summary.fps:g} fps; shown: {_names(chosen)}."
     write_text(target, to_html(Document(f"Data set {here.name}", lead, sections)))
     return target
@@ -147,19 +147,23 @@ def _curves(contents: Contents) -> list[str]:
     return [name for name, values in columns.items() if values is not None and values.ndim <= 2]
 
 
-def _clips(contents: Contents, chosen: Sequence[int]) -> list[Clip]:
+def _clips(contents: Contents, chosen: Sequence[int], side: int = 0) -> Iterator[Clip]:
+    """One after the other: minutes of several cameras would not fit side by side."""
     cameras = [c for c in contents.cameras if not is_depth(contents.features[c])]
-    return [
-        Clip(
-            contents.spans[n], contents.episodes[n], {camera: episode_frames(contents, camera, n) for camera in cameras}
-        )
-        for n in chosen
-    ]
+    for n in chosen:
+        frames = {camera: episode_frames(contents, camera, n, side) for camera in cameras}
+        yield Clip(contents.spans[n], contents.episodes[n], frames)
 
 
-def episode_frames(contents: Contents, camera: str, number: int) -> npt.NDArray[np.uint8]:
-    """Frames of one episode of a sound data set: uint8 (T, H, W, 3); a DataError where one cannot be decoded."""
-    return np.stack([frame for _, frame in rgb_frames(contents, camera, [contents.spans[number]])])
+def episode_frames(contents: Contents, camera: str, number: int, side: int = 0) -> npt.NDArray[np.uint8]:
+    """Frames of one episode of a sound data set: uint8 (T, H, W, 3), large ones reduced to about `side` pixels unless
+    that is 0; a DataError where one cannot be decoded.
+    """
+    small = []
+    for _, frame in rgb_frames(contents, camera, [contents.spans[number]]):
+        step = max(1, max(frame.shape[:2]) // side) if side else 1
+        small.append(frame[::step, ::step].copy())
+    return np.stack(small)
 
 
 def _episode_section(contents: Contents, clip: Clip) -> Section:
@@ -185,14 +189,12 @@ def _caption(contents: Contents, clip: Clip) -> str:
 
 
 def _camera_pictures(contents: Contents, clip: Clip, camera: str, frames: npt.NDArray[np.uint8]) -> list[Picture]:
-    step = max(1, max(frames.shape[1:3]) // SHOWN_SIDE)
-    small = frames[:, ::step, ::step]
-    scale = max(1, SHOWN_SIDE // max(small.shape[1:3]))
-    every = -(-len(small) // ANIMATED)
-    moving = [image_grid(frame[None, None], scale=scale) for frame in small[::every]]
+    scale = max(1, SHOWN_SIDE // max(frames.shape[1:3]))
+    every = -(-len(frames) // ANIMATED)
+    moving = [image_grid(frame[None, None], scale=scale) for frame in frames[::every]]
     still = png(moving[0])
-    at = spread(len(small), STRIP)
-    strip = png(image_grid(small[at][None], columns=[str(t) for t in at], scale=scale))
+    at = spread(len(frames), STRIP)
+    strip = png(image_grid(frames[at][None], columns=[str(t) for t in at], scale=scale))
     name, rate = f"episode-{clip.span.index}-{camera}", contents.fps / every
     shown = f"{contents.fps:g} fps" if every == 1 else f"every {ordinal(every)} frame"
     alt = f"Episode {clip.span.index} from {camera}"

@@ -19,7 +19,7 @@ from playslot_rl import cli
 from playslot_rl.data.contents import read_contents
 from playslot_rl.data.places import Problems
 from playslot_rl.datasets.split import split
-from playslot_rl.datasets.viz import episode_frames, spread
+from playslot_rl.datasets.viz import _clips, episode_frames, spread
 from playslot_rl.errors import ConfigError
 from playslot_rl.recipes import dataset as command
 from playslot_rl.recipes.actions import make_parser
@@ -199,6 +199,9 @@ def test_the_frames_shown_are_the_episodes(kind: str, request: pytest.FixtureReq
     contents = read_contents(root, Problems())
     shown = np.concatenate([episode_frames(contents, CAMERA, number) for number in range(3)])
     assert np.array_equal(shown, np.rint(frames_of(root) * 255).transpose(0, 2, 3, 1))
+    step = shown.shape[1] // 4
+    thin = np.concatenate([clip.frames[CAMERA] for clip in _clips(contents, [0, 1, 2], 4)])
+    assert np.array_equal(thin, shown[:, ::step, ::step])
     assert spread(3, 9) == [0, 1, 2]
     assert spread(100, 3) == [0, 50, 99]
 
