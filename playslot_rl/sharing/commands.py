@@ -183,16 +183,20 @@ def rate_words(policy: SharedPolicyConfig) -> str:
     return f"{now}: one frame in {stride}{of}, and each action is held until the next"
 
 
+def _rollout(policy: SharedPolicyConfig) -> str:
+    return f" `lerobot-rollout` needs `--fps={policy.fps:g}`: its own is 30." if policy.fps else ""
+
+
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
     """The paragraph on LeRobot's programs, as Markdown."""
     own, known = policy.env, experiment or ExperimentConfig()
     task_name = "/".join(filter(None, (own.name, own.task)))
     if own.name not in ENVIRONMENTS or own.id:  # LeRobot makes only tasks with a name
-        return REAL.format(why=NOWHERE, camera=policy.camera, rate=rate_words(policy))
+        return REAL.format(why=NOWHERE, camera=policy.camera, rate=rate_words(policy), told=_rollout(policy))
     task = task_config(task_name)
     alike = replace(own, image_size=task.image_size, frame_skip=task.frame_skip, max_steps=task.max_steps)
     if alike != task:
-        return REAL.format(why=CHANGED, camera=policy.camera, rate=rate_words(policy))
+        return REAL.format(why=CHANGED, camera=policy.camera, rate=rate_words(policy), told=_rollout(policy))
     acting = own.every(policy.stride)
     options = {
         "image_size": (own.image_size, 64),
@@ -219,8 +223,8 @@ NOWHERE: Final = "No simulator of this task ships with `playslot_rl`: `lerobot-e
 CHANGED: Final = "`lerobot-eval` has no options for what was changed of this task; `playslot evaluate` runs it."
 REAL: Final = """\
 {why}
-It is shown the frames of the robot, {rate}. In LeRobot's own terms, with `playslot_rl` and `lerobot_policy_playslot`
-installed:
+It is shown the frames of the robot, {rate}.{told} In LeRobot's own terms, with `playslot_rl` and
+`lerobot_policy_playslot` installed:
 
 ```python
 from lerobot.policies import make_pre_post_processors

@@ -116,6 +116,7 @@ def test_a_policy_of_every_third_frame_says_at_which_rate_it_acts(strided: Path,
     card = exported(strided, tmp_path / "policy")
     assert "| frames | 10 a second: one frame in 3 of 30, and each action is held until the next |" in card
     assert "uint8 (H, W, 3); 10 a second: one frame in 3 of 30" in card
+    assert "`lerobot-rollout` needs `--fps=10`" in card
     assert "| task | push |" in card
     assert "agent steps" not in card  # recordings have no end of an episode
     config = read_config(tmp_path / "policy")
