@@ -21,7 +21,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from playslot_rl.config import EnvConfig
+from playslot_rl.config import DataConfig, EnvConfig
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import note_read
 from playslot_rl.data.neighbours import in_batches
@@ -270,6 +270,15 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
         say_once(
             f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
             "one policy is not told apart: make a set of each by `playslot dataset split` without --fractions"
+        )
+
+
+def say_averaged(data: DataConfig) -> None:
+    """Say that a stride averages actions, which absolute targets are not made for."""
+    if data.stride > 1 and data.stride_action == "mean":
+        say_once(
+            f"note: data.stride={data.stride}: actions are the mean of so many; for absolute targets, grippers or "
+            "angles that wrap take the last by data.stride_action=last"
         )
 
 

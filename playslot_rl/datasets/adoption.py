@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, SAViConfig
+from playslot_rl.data.demonstrations import say_averaged
 from playslot_rl.data.views import IntArray
 from playslot_rl.data.windows import split_episodes
 from playslot_rl.datasets.survey import Choice, Survey, choose_size, choose_stride
@@ -213,10 +214,8 @@ def for_frames(config: ExperimentConfig, seen: Survey, decide: Decisions) -> Exp
     """The config with frame size, stride, and clips that the episodes have room for."""
     size = decide("frame size", lambda: choose_size(seen))
     stride = decide("stride", lambda: choose_stride(seen, size))
-    if stride > 1 and seen.action_dim:
-        how = config.data.stride_action
-        ask = "; for absolute targets, grippers or angles that wrap: data.stride_action=last"
-        print(f"actions: the {how} of the {stride} from one kept frame to the next{ask * (how == 'mean')}", flush=True)
+    if seen.action_dim:
+        say_averaged(replace(config.data, stride=stride))
     kept = -(-seen.lengths // stride)
     typical, dynamics = int(np.median(kept)), config.dynamics
     longest, validation = clip_room(kept, shortest(config), config.data.validation, config.seed)

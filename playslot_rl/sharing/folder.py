@@ -156,14 +156,19 @@ def read_config(folder: Path) -> SharedPolicyConfig:
         for name, stated, made in zip(("in", "out"), _shapes(values), _shapes(config.to_lerobot()), strict=True):
             if stated != made:
                 raise ValueError(f"{name}put_features: got shapes {stated}, but env and model are of {made}")
-        if config.env.name in RECORDED and "actions" not in ours:
-            raise ValueError("got a policy that clips the robot's actions to [-1, 1]: train it again")
+        require_range(config.env, ours.get("actions"))
         return config
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         raise CheckpointError(
             f"{path}: {what}; expected a config of this version of playslot_rl: export the policy again"
         ) from error
+
+
+def require_range(env: EnvConfig, actions: dict[str, Any] | None) -> None:
+    """Refuse a policy for a robot of a version that knew no range of its actions, by a ValueError."""
+    if env.name in RECORDED and actions is None:
+        raise ValueError("got a policy that clips the robot's actions to [-1, 1]: train it again")
 
 
 def _shapes(values: dict[str, Any]) -> list[dict[str, list[int]]]:

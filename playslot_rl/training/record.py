@@ -20,7 +20,7 @@ from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.demonstrations import DemonstrationSplit, require_tasks, split_demonstrations
+from playslot_rl.data.demonstrations import DemonstrationSplit, require_tasks, say_averaged, split_demonstrations
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.videos import open_videos
@@ -120,6 +120,8 @@ class StageRecord:
             )
         found = split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
         require_tasks(found.trained, config.env)
+        if found.trained.limits is not None:  # a robot's own actions
+            say_averaged(data)
         return found
 
     def seen(self, frames: int) -> dict[str, Any]:

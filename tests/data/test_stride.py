@@ -9,6 +9,7 @@ import pytest
 
 from playslot_rl.config import to_dict
 from playslot_rl.config.compose import compose
+from playslot_rl.data.demonstrations import say_averaged
 from playslot_rl.data.source import open_sources
 from playslot_rl.data.views import every
 from playslot_rl.data.weighted import open_configured
@@ -54,3 +55,11 @@ def test_another_stride_is_another_data_set_and_one_is_the_set_itself(foreign_im
     assert len({every(source, stride).fingerprint for stride in (1, 2, 3)}) == 3
     with pytest.raises(ValueError, match="got 0, expected 1"):
         every(source, 0)
+
+
+def test_who_clones_averaged_actions_is_told_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+    for typed in ("data.stride=1", "data.stride=7", "data.stride=7", "data.stride=9 data.stride_action=last"):
+        say_averaged(compose(["env=video", *typed.split()]).data)
+    said = capsys.readouterr().err
+    assert said.startswith("note: data.stride=7: actions are the mean of so many; for absolute targets")
+    assert said.count("\n") == 1

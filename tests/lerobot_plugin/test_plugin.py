@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from playslot_rl.envs import task_env
 from playslot_rl.envs.lerobot import LeRobotTask, frames_a_second
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.sharing.folder import FILES, SharedPolicyConfig, save_pretrained
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.testing import tiny_agent
 
 SEED = 1_000_000_000
@@ -171,6 +173,25 @@ def test_lerobots_loading_is_strict(folder: Path, tmp_path: Path) -> None:
     weights.write_bytes(weights.read_bytes()[:-1] + b"\x7f")
     with pytest.raises(CheckpointError, match="got fingerprint"):
         get_policy_class("playslot").from_pretrained(broken)
+
+
+def test_lerobot_refuses_a_robots_policy_of_an_earlier_version(folder: Path, tmp_path: Path) -> None:
+    import shutil
+
+    from lerobot.policies.factory import get_policy_class
+
+    import lerobot_policy_playslot  # noqa: F401
+
+    old = Path(shutil.copytree(folder, tmp_path / "old"))
+    values = json.loads((old / "config.json").read_text())
+    values["env"]["name"] = "video"
+    for actions in ({"actions": {}}, {}):
+        write_json(old / "config.json", values | actions)
+        if actions:
+            assert get_policy_class("playslot").from_pretrained(old).config.actions == {}
+        else:
+            with pytest.raises(ValueError, match=r"clips the robot's actions to \[-1, 1\]: train it again"):
+                get_policy_class("playslot").from_pretrained(old)
 
 
 def test_a_task_looks_as_lerobot_expects(task: LeRobotTask) -> None:

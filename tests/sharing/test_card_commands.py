@@ -90,7 +90,8 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def strided(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on every third frame, resized."""
-    return trained(tmp_path_factory.mktemp("run") / "run", recordings, "data.stride=3", "data.validation=0.2")
+    typed = ("data.stride=3", "data.stride_action=last", "data.validation=0.2")
+    return trained(tmp_path_factory.mktemp("run") / "run", recordings, *typed)
 
 
 @pytest.mark.integration

@@ -30,7 +30,7 @@ class PlaySlotConfig(PreTrainedConfig):
     fps: float = 0.0
     fingerprint: str = ""
     source: dict[str, Any] = field(default_factory=dict)
-    actions: dict[str, Any] = field(default_factory=dict)
+    actions: dict[str, Any] | None = None
     license: str | None = LICENCE
 
     # LeRobot's own fields, declared again with their types, which mypy cannot read there.

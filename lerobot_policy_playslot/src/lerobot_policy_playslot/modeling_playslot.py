@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_policy_playslot.configuration_playslot import NOT_TRAINED_HERE, PlaySlotConfig
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
-from playslot_rl.sharing.folder import WEIGHTS, build_agent, load_weights, write_weights
+from playslot_rl.sharing.folder import WEIGHTS, build_agent, load_weights, require_range, write_weights
 
 
 class PlaySlotPolicy(PreTrainedPolicy):
@@ -81,8 +81,11 @@ class PlaySlotPolicy(PreTrainedPolicy):
     def _load_as_safetensor(
         cls, model: PlaySlotPolicy, model_file: str, map_location: str, strict: bool
     ) -> PlaySlotPolicy:
-        """Load the weights, every one of them, whatever `strict` says, else a CheckpointError."""
+        """Load the weights, every one of them, whatever `strict` says, else a CheckpointError; a ValueError for a
+        robot's policy without the range of its actions.
+        """
         del strict
+        require_range(model.policy_config.env, model.config.actions)
         load_weights(model.agent, Path(model_file), model.policy_config)
         model.to(map_location)
         return model

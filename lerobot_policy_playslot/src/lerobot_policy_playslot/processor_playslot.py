@@ -17,4 +17,4 @@ def make_playslot_pre_post_processors(
     which the policy was trained on, not of `dataset_stats`.
     """
     del dataset_stats
-    return make_processors(str(config.device), config.actions)
+    return make_processors(str(config.device), config.actions or {})
