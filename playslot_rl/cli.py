@@ -1,7 +1,7 @@
 """The `playslot` command: a thin front of the recipes.
 
 Every sub-command is one module of `playslot_rl.recipes`; its arguments are `key=value` overrides.
-Exit codes: 0 done, 1 an error of the run, 2 bad arguments, 130 interrupted.
+Exit codes: 0 done, 1 an error of the run, 2 bad arguments, 130 interrupted, 141 standard output closed.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import select
 import sys
 import textwrap
 import time
@@ -27,6 +28,8 @@ SEVERAL: Final = ("train-slots", "train-dynamics", "train-policy", "train-baseli
 ANEW: Final = ("inspect", "plan", "play", "bench", "doctor", "dataset", "cache")
 """Commands that start over when they are typed again."""
 INTERRUPTED: Final = 130
+CLOSED: Final = 141
+"""Nobody reads standard output any more: as of a program that SIGPIPE ends."""
 OWN_PATIENCE_S: Final = 1.0
 PEER_PATIENCE_S: Final = 5.0
 """How long a process waits for another one's line: with an error of its own, and where it lost the other one."""
@@ -90,6 +93,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command, of `sys.argv` where None is given, and return the exit code. `--help`, `--version` and bad usage
     raise `SystemExit`, as argparse does.
     """
+    try:
+        return _main(argv)
+    finally:
+        _unread()  # else the end of the process would complain
+
+
+def _main(argv: Sequence[str] | None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments:
         _top_parser().print_help()
@@ -183,9 +193,25 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
             raise
         return _fail(name, explain(error), 1, patience_s=PEER_PATIENCE_S)
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _unread():
+            return CLOSED
         if _debugging():
             raise
         return _fail(name, explain(error), 1)
+
+
+def _unread() -> bool:
+    """Whether nobody reads standard output any more, as after `| head`; then what is left for it goes nowhere."""
+    try:
+        said = sys.stdout.fileno()
+    except (OSError, ValueError):
+        return False  # it is no file: the pipe was a worker's
+    poll = select.poll()
+    poll.register(said, 0)
+    broken = any(event & select.POLLERR for _, event in poll.poll(0))
+    if broken:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), said)
+    return broken
 
 
 def _debugging() -> bool:

@@ -324,6 +324,27 @@ def test_debugging_shows_the_traceback(recipe: Callable[[str, Recipe], None], mo
         cli.main(["demo", "preset=smol"])
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [["train-slots", "--help"], ["models"]])
+def test_who_reads_no_further_gets_no_complaint(arguments: list[str], unbuffered: str) -> None:
+    command = subprocess.Popen(
+        [sys.executable, "-m", "playslot_rl", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+    )  # fmt: skip
+    assert command.stdout is not None
+    command.stdout.close()
+    assert command.communicate()[1] == ""
+    assert command.returncode in (0, cli.CLOSED)
+
+
+def test_the_broken_pipe_of_a_worker_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> int:
+        raise BrokenPipeError("worker 1 is gone")
+
+    assert cli._guarded("collect", fail) == 1
+    assert "worker 1 is gone" in capsys.readouterr().err
+
+
 def test_the_installed_command_works_from_another_folder(tmp_path: Path) -> None:
     command = Path(sys.executable).parent / "playslot"
     done = subprocess.run([command, "evaluate", "run=nothing"], cwd=tmp_path, capture_output=True, text=True)
