@@ -6,6 +6,7 @@ Writes `RUN/planning/GOALS/METHOD/eval_info.json`, `plan.png` beside it, `GOALS/
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -66,7 +67,7 @@ def main(config: ExperimentConfig) -> None:
             common |= {"fingerprints": facts.fingerprints, "commit": source_commit(), "trained_at": facts.trained_at}
             common |= {"size": asdict(size)}
             parts[goals] = _measure(config, agent, pool, goals, folder / goals, common)
-    report = {"run": config.run, "command": "playslot " + " ".join(sys.argv[1:]), "settings": to_dict(config.plan)}
+    report = {"run": config.run, "command": shlex.join(["playslot", *sys.argv[1:]]), "settings": to_dict(config.plan)}
     report |= {"goals": parts, **_facts(config, run.folder)}
     write_json(folder / "planning.json", report)
     page = to_markdown(planning_page(report))

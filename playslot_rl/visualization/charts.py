@@ -250,7 +250,7 @@ def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
     for i, (name, values) in enumerate(counts.items()):
         share = 100 * np.array(values) / max(1, sum(values))
         x = np.arange(len(values)) + (i - (len(counts) - 1) / 2) * width
-        axes.bar(x, share, width * 0.92, color=theme.series[i], label=name)
+        axes.bar(x, share, width * 0.92, color=theme.series[i % len(theme.series)], label=name)
     axes.set_xticks(range(k))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,17 +25,19 @@ COLLECT = "playslot collect out=DIR policy=random"
 @dataclass(frozen=True)
 class LatentData:
     """Latent actions of a data set: codes int64 (M, 1) or (M, N), actions (M, A) as they were recorded, if there are
-    any, and the result of `probe_actions`, None without actions that are numbers.
+    any, and the result of `probe_actions`, None without actions that are numbers; of all episodes of the set or of its
+    first `MOST`.
     """
 
     name: str
     codes: Any
     actions: Any
     probe: dict[str, Any] | None
+    whole: bool = True
 
 
-def read_latents(model: WorldModel, root: Path, given: ReportInput) -> LatentData:
-    """Latent actions of up to `MOST` episodes of a data set, with the probe where it has actions."""
+def read_latents(model: WorldModel, root: Path, given: ReportInput, name: str) -> LatentData:
+    """Latent actions of up to `MOST` episodes of a data set of that name, with the probe where it has actions."""
     from playslot_rl.data.cache import Cache
     from playslot_rl.data.slot_cache import slot_cache
     from playslot_rl.data.weighted import open_configured
@@ -43,17 +46,26 @@ def read_latents(model: WorldModel, root: Path, given: ReportInput) -> LatentDat
     source = open_configured(given.config, [root])
     prints = str(given.metas.get("slots", {}).get("fingerprint", ""))
     slots = slot_cache(source, model.savi, prints, Cache.of(data), module_device(model))
-    starts, lengths = source.starts[:MOST], source.lengths[:MOST]
+    starts, lengths, whole = source.starts[:MOST], source.lengths[:MOST], len(source.starts) <= MOST
     z, codes, episodes = infer_latents(model.inverse_dynamics, slots, starts, lengths, source.actions)
     if source.actions is None:
-        return LatentData(root.name, codes, None, None)
+        return LatentData(name, codes, None, None, whole)
     rows = np.concatenate([np.arange(s, s + n - 1) for s, n in zip(starts, lengths, strict=True) if n > 1])
     actions, probed = np.asarray(source.actions[rows]), probed_actions(source, rows)
     known = np.isfinite(actions).all(axis=1)
     if probed is None or len(np.unique(episodes[known])) < 2:
-        return LatentData(root.name, codes, actions, None)
+        return LatentData(name, codes, actions, None, whole)
     probe = probe_actions(z[known], probed[known], episodes[known], codes=codes[known])
-    return LatentData(root.name, codes, actions, probe)
+    return LatentData(name, codes, actions, probe, whole)
+
+
+def told_apart(folders: Sequence[Path]) -> list[str]:
+    """Their names, with as many folders above them as tell them apart."""
+    for depth in range(1, max(len(folder.parts) for folder in folders)):
+        names = [Path(*folder.parts[-depth:]).as_posix() for folder in folders]
+        if len({*names}) == len(names):
+            return names
+    return list(map(str, folders))
 
 
 def latent_section(given: ReportInput) -> Section:
@@ -65,9 +77,9 @@ def latent_section(given: ReportInput) -> Section:
         return Section(title, [Missing("The run names no data set on this machine.", COLLECT)])
     model = given.world_model
     sets, blocks = [], list[Block]()
-    for root in found:
+    for root, name in zip(found, told_apart(found), strict=True):
         try:
-            sets.append(read_latents(model, root, given))
+            sets.append(read_latents(model, root, given, name))
         except DataError as error:  # the rest of the report does not depend on it
             blocks.append(Missing(f"A data set cannot be read: {error}.", COLLECT))
     if not sets:
@@ -85,8 +97,9 @@ def _usage(sets: list[LatentData], k: int) -> list[Block]:
     rows = [[n, f"{u['used']} of {k}", f"{u['perplexity']:.2f}", str(sum(u["counts"]))] for n, u in usage.items()]
     counts = {n: u["counts"] for n, u in usage.items()}
     alt = "Share of transitions by code. " + "; ".join(f"{n}: {', '.join(map(str, c))}" for n, c in counts.items())
+    some = "" if all(d.whole for d in sets) else f"The first {MOST} episodes of each data set."
     return [
-        Table(["data set", "codes in use", f"perplexity (1 to {k})", "transitions"], rows),
+        Table(["data set", "codes in use", f"perplexity (1 to {k})", "transitions"], rows, some),
         chart("codebook", lambda theme: usage_chart(counts, theme), alt, "Codebook usage."),
     ]
 

@@ -54,7 +54,7 @@ def write_report(
             module.eval()
     with TaskPool(config.acting, config.render) if pool is None else nullcontext(pool) as used:
         relative = os.path.relpath(run)
-        shown = relative if not relative.startswith("..") else run.name
+        shown = relative if not relative.startswith("..") else run.name  # a report names no folder of this machine
         given = ReportInput(run, config, model, agent, used, shown, read_metas(run))
         document = build_objects(given) if config.env.name in PROCEDURAL else build(given)
     return write_document(document, run, "report")
@@ -113,7 +113,9 @@ def settings_section(given: ReportInput) -> Section:
     for protocol, result in given.evaluations.items():
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
-        measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn"])
+        drawn = result.get("render", {}).get("quality", given.config.render.quality)
+        how = f"at most {result.get('max_steps', env.max_steps)} agent steps, rendering `{drawn}`"
+        measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn, {how}"])
     return Section(
         "Settings and notes", [part.settings_table(model, task, measured), *(Text(note) for note in notes(given))]
     )
@@ -156,6 +158,7 @@ def build_objects(given: ReportInput) -> Document:
     """All sections of the report on known objects; what is missing is named with its command."""
     config, grid = given.config, given.config.env.grid
     result = json_or_nothing(given.run / RESULT) or None
+    result = result if result and given.measures(result) else None
     seed = first_seed(config, config.seed) if result is None else int(result["seeds"][0])
     clips = generate(range(seed, seed + CLIPS_SHOWN), config.env.max_steps, config.env)
     sections = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -42,12 +43,12 @@ METRICS: Final = {
     "moving_explained": ("share of the moving pixels' change that is drawn", SHARE),
     "usage": ("prototypes in use", SHARE),
     "perplexity": ("perplexity of the codes", NUMBER),
-    "unexplained_parsed": ("policy, from parsed slots", SHARE),
-    "unexplained_imagined": ("policy, from imagined slots", SHARE),
-    "oracle_unexplained": ("slot oracle", SHARE),
-    "decoder_trial_unexplained": ("trial of an action decoder that reads slots", SHARE),
-    "decoder_unexplained": ("action decoder", SHARE),
-    "finetune_unexplained": ("policy and decoder tuned together", SHARE),
+    "unexplained_parsed": ("latents of the policy, from parsed slots", SHARE),
+    "unexplained_imagined": ("latents of the policy, from imagined slots", SHARE),
+    "oracle_unexplained": ("actions of the slot oracle", SHARE),
+    "decoder_trial_unexplained": ("actions of a decoder that reads slots, on trial", SHARE),
+    "decoder_unexplained": ("actions of the action decoder", SHARE),
+    "finetune_unexplained": ("actions of policy and decoder tuned together", SHARE),
 }
 """Key of a stage's metric: its words, and how its value is written. Those of `unexplained` are variances."""
 HELD_OUT: Final = "_held_out"
@@ -60,7 +61,8 @@ class ReportInput:
 
     Attributes:
         pool: environments for the pictures.
-        shown: how the run folder is written in commands: relative where that is possible.
+        shown: how the run folder is written in commands: relative where it lies below the present one, else by its
+            name.
         metas: stage -> `meta.json` of its finished checkpoint.
     """
 
@@ -76,9 +78,10 @@ class ReportInput:
     def evaluations(self) -> dict[str, dict[str, Any]]:
         """Protocol -> `eval_info.json`, for those that are there and of the weights that the run has now."""
         found = {name: json_or_nothing(self.run / "evaluation" / name / "eval_info.json") for name in PROTOCOLS}
-        return {name: one for name, one in found.items() if one and self._measures(one)}
+        return {name: one for name, one in found.items() if one and self.measures(one)}
 
-    def _measures(self, result: dict[str, Any]) -> bool:
+    def measures(self, result: dict[str, Any]) -> bool:
+        """Whether a result is of the weights that the run has now."""
         pairs = [(self.metas.get(s, {}).get("fingerprint"), of) for s, of in result.get("fingerprints", {}).items()]
         return all(now in (None, of) for now, of in pairs)
 
@@ -89,7 +92,7 @@ class ReportInput:
         return int(seeds[0]) if seeds else first_seed(self.config, self.config.seed)
 
     def command(self, name: str, rest: str = "") -> str:
-        return f"playslot {name} run={self.shown}{' ' + rest if rest else ''}"
+        return f"{shlex.join(('playslot', name, f'run={self.shown}'))}{' ' + rest if rest else ''}"
 
 
 def chart(name: str, draw: Callable[[Theme], bytes], alt: str, caption: str) -> Picture:
@@ -133,7 +136,10 @@ def success_section(given: ReportInput) -> Section:
             cells.append([name, said, interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         same = "the same seeds" if len(_by_seeds(results)) == 1 else "the seeds that are named"
-        blocks.append(Table(headers, cells, f"Wilson intervals. References run closed-loop on {same}."))
+        lengths = {name: result.get("max_steps") for name, result in results.items()}
+        long = ", ".join(f"{steps} in {name}" for name, steps in lengths.items())
+        unlike = f" Episodes differ in agent steps: {long}." if len({*lengths.values()}) > 1 else ""
+        blocks.append(Table(headers, cells, f"Wilson intervals. References run closed-loop on {same}.{unlike}"))
         blocks += _task_table(rows)
         drawn = [
             (n, r["success_rate"], tuple(r["ci95"]), method)
@@ -238,7 +244,10 @@ def slots_section(given: ReportInput, clip: Callable[[], Any], what: str = EXPER
     )
     picture = Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)
     blocks: list[Block] = [picture]
-    if result := json_or_nothing(given.run / SLOTS_RESULT):
+    result = json_or_nothing(given.run / SLOTS_RESULT)
+    if result and not given.measures(result):
+        blocks.append(Missing("These slots have not been scored.", given.command("evaluate", "protocol=slots")))
+    elif result:
         scored = (
             f"On {result['episodes']} held-out episodes of the expert: FG-ARI {result['foreground_ari']:.2f} and ARI "
             f"{result['ari']:.2f} against the simulator's segmentation (1 is perfect, 0 chance), "
@@ -279,10 +288,10 @@ def metric_text(metrics: Mapping[str, Any]) -> str:
 
 
 def _unexplained(metrics: dict[str, Any]) -> list[Block]:
-    """Variance of the actions that each network of the behaviour stage leaves unexplained, trained on and held out."""
+    """Variance that each network of the behaviour stage leaves unexplained, trained on and held out."""
     names = [name for name in METRICS if "unexplained" in name and name in metrics]
     rows = [[METRICS[n][0], percent(metrics[n]), percent(metrics.get(n + HELD_OUT))] for n in names]
-    headers = ["unexplained variance of the actions", "demonstrations trained on", "held-out demonstrations"]
+    headers = ["unexplained variance", "demonstrations trained on", "held-out demonstrations"]
     return [Table(headers, rows)] if rows else []
 
 

@@ -19,8 +19,8 @@ from playslot_rl.testing import tiny_config
 from playslot_rl.visualization import latents
 from playslot_rl.visualization.charts import loss_names
 from playslot_rl.visualization.document import Document, Missing, Section, Table, Text, to_html, to_markdown
-from playslot_rl.visualization.report import notes, read_metas, write_report
-from playslot_rl.visualization.sections import ReportInput, success_section
+from playslot_rl.visualization.report import notes, read_metas, settings_section, write_report
+from playslot_rl.visualization.sections import ReportInput, slots_section, success_section
 from playslot_rl.world_model import Agent, WorldModel
 
 REFERENCES = {
@@ -109,10 +109,10 @@ def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: py
         (folder / "meta" / "info.json").touch()
     monkeypatch.setattr(latents, "data_folders", lambda *_: folders)
 
-    def read(model: WorldModel, root: Path, given: object) -> latents.LatentData:
+    def read(model: WorldModel, root: Path, given: object, name: str) -> latents.LatentData:
         if root.name == "broken":
             raise DataError("broken: no such thing")
-        return latents.LatentData(root.name, codes, actions, probe)
+        return latents.LatentData(name, codes, actions, probe)
 
     monkeypatch.setattr(latents, "read_latents", read)
     run = _run(tmp_path, config)
@@ -207,3 +207,48 @@ def test_a_mode_without_prototypes_is_said_so(tmp_path: Path) -> None:
     model = WorldModel(config.model, config.env)
     write_report(tmp_path, config, world_model=model)
     assert "mode is `continuous`, which has no prototypes" in (tmp_path / "report.md").read_text()
+
+
+def test_sets_of_one_name_are_told_apart_and_any_number_has_a_chart(tmp_path: Path) -> None:
+    from playslot_rl.visualization.charts import LIGHT, usage_chart
+
+    folders = [tmp_path / name for name in ("a/train", "b/train", "c")]
+    assert latents.told_apart(folders) == ["a/train", "b/train", f"{tmp_path.name}/c"]
+    assert latents.told_apart(folders[1:]) == ["train", "c"]
+    sets = [latents.LatentData(str(n), np.zeros((6, 1), np.int64), None, None, whole=n > 0) for n in range(9)]
+    table, picture = latents._usage(sets, 4)
+    assert isinstance(table, Table)
+    assert len(table.rows) == 9
+    assert table.caption == "The first 200 episodes of each data set."
+    assert latents._usage(sets[1:], 4)[0].caption == ""  # type: ignore[union-attr]
+    assert usage_chart({str(n): [1, 2] for n in range(30)}, LIGHT)
+    assert picture is not None
+
+
+def test_scores_of_other_weights_and_of_other_episodes_are_not_passed_off(tmp_path: Path) -> None:
+    run = _run(tmp_path, tiny_config())
+    given = ReportInput(
+        run, tiny_config(), None, None, TaskPool(tiny_config().env, tiny_config().render), "run", read_metas(run)
+    )
+    for protocol, steps in (("simulation", 9), ("imagination", 6)):
+        path = run / "evaluation" / protocol / "eval_info.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"max_steps": steps, "render": {"quality": "full"}}))
+    text = to_markdown(Document("", "", [success_section(given), settings_section(given)]))
+    assert "Episodes differ in agent steps: 9 in simulation, 6 in imagination." in text
+    assert "at most 9 agent steps, rendering `full`" in text
+    scored = {"episodes": 20, "foreground_ari": 0.99, "ari": 0.9, "slots_per_object": 1.0, "psnr": 30.0}
+    path = run / "evaluation" / "slots" / "eval_info.json"
+    path.parent.mkdir()
+    model = WorldModel(tiny_config().model, tiny_config().env)
+    shown = replace(given, world_model=model, metas={"slots": {"fingerprint": "now"}})
+    for of in ("now", "before"):
+        path.write_text(json.dumps(scored | {"fingerprints": {"slots": of}}))
+        said = slots_section(shown, lambda: np.zeros((3, 64, 64, 3), np.uint8))
+        assert any(isinstance(block, Text) and "FG-ARI 0.99" in block.text for block in said.blocks) == (of == "now")
+        assert any(isinstance(block, Missing) for block in said.blocks) == (of == "before")
+
+
+def test_commands_can_be_pasted(tmp_path: Path) -> None:
+    pool = TaskPool(tiny_config().env, tiny_config().render)
+    given = ReportInput(tmp_path, tiny_config(), None, None, pool, "runs/a b")
+    assert given.command("evaluate", "protocol=replay") == "playslot evaluate 'run=runs/a b' protocol=replay"
