@@ -203,12 +203,11 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
 def _unread() -> bool:
     """Whether nobody reads standard output any more, as after `| head`; then what is left for it goes nowhere."""
     try:
-        said = sys.stdout.fileno()
-    except (OSError, ValueError):
-        return False  # it is no file: the pipe was a worker's
-    poll = select.poll()
+        said, poll = sys.stdout.fileno(), select.poll()
+    except (AttributeError, OSError, ValueError):
+        return False  # it is no file, or a system that cannot tell
     poll.register(said, 0)
-    broken = any(event & select.POLLERR for _, event in poll.poll(0))
+    broken = any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
     if broken:
         os.dup2(os.open(os.devnull, os.O_WRONLY), said)
     return broken

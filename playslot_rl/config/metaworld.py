@@ -102,7 +102,7 @@ def several(task: str) -> tuple[str, ...]:
 
 def has_small(task: str) -> bool:
     """Whether it is of `SMALL`, or a set with some."""
-    return any(name in SMALL for name in several(task) or (task,))
+    return any(name.removesuffix(VERSION) in SMALL for name in several(task) or (task,))
 
 
 def seen_by(task: str, camera: str) -> str:

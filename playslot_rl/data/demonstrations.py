@@ -269,7 +269,8 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
     if not env.tasks and len(tasks) > 1:
         say_once(
             f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
-            "one policy is not told apart: make a set of each by `playslot dataset split` without --fractions"
+            "one policy is not told apart: train on those of one, a set that `playslot dataset split` makes without "
+            "--fractions"
         )
 
 

@@ -108,7 +108,7 @@ def show_in_rerun(root: str | Path, episodes: int = 6) -> str:
         ) from error
     contents = require_sound(root)
     chosen = spread(len(contents.spans), episodes)
-    rr.init(f"playslot dataset {contents.root.absolute().name}", spawn=True)
+    rr.init(f"playslot dataset {by_name(contents.root).name}", spawn=True)
     for clip in _clips(contents, chosen):
         where = f"episode_{clip.span.index}"
         for t in range(clip.span.length):

@@ -163,8 +163,9 @@ class LatentCloning(ABC):
         every = torch.arange(len(moved), device=self.device)
         frames = [FrameInputs(copy, moved, self.device, resident=False) for copy in self.copies]
         features = [apply_rows(self.policy.features, self.observe(part), every) for part in frames]
-        shown = torch.cat((demos.slots, *features))
-        return replace(demos.take(every.repeat(1 + len(frames))), slots=shown, imagined=shown)
+        shown, none = torch.cat((demos.slots, *features)), demos.slots[:, :0]  # what is taken apart is not copied
+        taken = replace(demos, slots=none, imagined=none).take(every.repeat(1 + len(frames)))
+        return replace(taken, slots=shown, imagined=shown)
 
     def _decided(self, seen: Seen, rows: Tensor) -> Demonstrations:
         """What the decoder meets of some rows: the policy's features in place of slots."""
@@ -253,6 +254,8 @@ def cloning(
     """
     config, name, split, policy = record.config, record.name, record.demos, behaviour.schedule
     labelled = {"labelled_demos": config.behaviour.labelled_demos, "inputs": config.behaviour.decoder_inputs}
+    if behaviour.copies:
+        labelled["decoder_views"] = 1 + len(behaviour.copies)
     group, schedule = at or f"baselines.{name}", at or f"baselines.{name}.policy"
 
     def part(folder: str, stage: Stage, steps: int, lr: float) -> Part:

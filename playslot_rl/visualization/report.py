@@ -114,7 +114,7 @@ def settings_section(given: ReportInput) -> Section:
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
         drawn = result.get("render", {}).get("quality", given.config.render.quality)
-        how = f"at most {result.get('max_steps', env.max_steps)} agent steps, rendering `{drawn}`"
+        how = f"at most {result.get('max_steps', given.config.acting.max_steps)} agent steps, rendering `{drawn}`"
         measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn, {how}"])
     return Section(
         "Settings and notes", [part.settings_table(model, task, measured), *(Text(note) for note in notes(given))]

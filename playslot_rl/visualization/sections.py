@@ -136,7 +136,7 @@ def success_section(given: ReportInput) -> Section:
             cells.append([name, said, interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         same = "the same seeds" if len(_by_seeds(results)) == 1 else "the seeds that are named"
-        lengths = {name: result.get("max_steps") for name, result in results.items()}
+        lengths = {name: result.get("max_steps", given.config.acting.max_steps) for name, result in results.items()}
         long = ", ".join(f"{steps} in {name}" for name, steps in lengths.items())
         unlike = f" Episodes differ in agent steps: {long}." if len({*lengths.values()}) > 1 else ""
         blocks.append(Table(headers, cells, f"Wilson intervals. References run closed-loop on {same}.{unlike}"))

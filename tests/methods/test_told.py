@@ -15,7 +15,11 @@ from playslot_rl.acting.agent import ImaginationActor, imagine, oracle_actor, pl
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.episodes import Outcome
 from playslot_rl.config import BehaviourStageConfig, EnvConfig, OptimConfig, PolicyConfig
+from playslot_rl.config.compose import compose
 from playslot_rl.config.metaworld import SETS
+from playslot_rl.config.methods import METHODS
+from playslot_rl.data.action_limits import ActionLimits
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.demonstrations import Demonstrations, require_tasks, told_tasks, transitions
 from playslot_rl.data.views import concatenate, drawn_demonstrations, episode_range
 from playslot_rl.envs import task_config
@@ -24,6 +28,7 @@ from playslot_rl.evaluation.success import summary
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.testing import tiny_agent, tiny_config
+from playslot_rl.training import record
 from playslot_rl.training.fit import Part, fit
 from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage
 from playslot_rl.world_model import Agent
@@ -142,6 +147,25 @@ def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
     for tasks in (None, np.array([*said[:5], "Dance."])):
         with pytest.raises(DataError, match=r"got demonstrations of '(nothing|Dance\.)', expected the tasks of"):
             told(replace(source, tasks=tasks))
+
+
+@pytest.mark.parametrize("method", ["act", "lapo", "playslot"])
+def test_every_method_refuses_other_tasks_and_is_told_what_it_clones(
+    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = replace(videos(32), name=f"{method}s", tasks=np.array(["Pull the drawer open."] * 5 + ["Dance."]))
+    found = replace(found, limits=ActionLimits(("x", "y"), *[np.zeros(2, np.float32)] * 4))
+    monkeypatch.setattr(record, "open_videos", lambda *_: found)
+    typed = ["preset=smoke", "env=metaworld", f"method={method}", "data.demos=x", "data.held_out=0", "demos=6"]
+    stage = METHODS[method].last
+    with pytest.raises(DataError, match=r"got demonstrations of 'Pull the drawer open\.', expected the tasks of"):
+        record.StageRecord(stage, tmp_path, compose([*typed, "env.task=push"])).demos  # noqa: B018
+    say_once.cache_clear()
+    stride = f"data.stride={2 + len(method)}"
+    assert record.StageRecord(stage, tmp_path, compose([*typed, "env.task=drawer-open", stride])).demos
+    said = capsys.readouterr().err
+    assert f"note: {method}s: got demonstrations of 2 tasks ('Dance.', 'Pull the drawer open.', ...)" in said
+    assert f"note: {stride}: actions are the mean of so many" in said
 
 
 def test_success_is_told_by_task() -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -158,7 +158,10 @@ def training(record: StageRecord, state: bool = False) -> Training:
     measured = other is not None and bool(np.isfinite(other.require_actions()).all() or not other.unlabelled)
     held_out = chunked(config, other, own, chunk, device, 0, state) if other is not None and measured else None
     stage = ChunkStage(policy, own, trained, held_out)
-    facts = {"pretraining": pretraining, "chunk": chunk, **({"state": policy.state_dim} if state else {})}
+    facts: dict[str, Any] = {"pretraining": pretraining, "chunk": chunk}
+    facts |= {"state": policy.state_dim} if state else {}
+    if pretraining == "scratch" and isinstance(own, ACTConfig):
+        facts["norms"] = "learned"  # a training of before, whose layers were frozen, does not go on
     part = Part(f"baselines.{record.name}", stage, own, group=group, optimizer=partial(_optimizer, policy, own))
     said = f", chunks of {chunk}, ResNet-18 from {pretraining}"
     return cloning_alone(record, part, len(trained), said, facts)
