@@ -19,6 +19,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.data.demonstrations import DemonstrationSplit, transitions
 from playslot_rl.data.neighbours import pairs_at
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import DIRECTIONS
 from playslot_rl.methods.caddy.behaviour import CADDYBehaviour, MovesLoss, infer_moves, oracle_stage
 from playslot_rl.methods.caddy.heads import MovesHead, OnFrames, as_moves, states_of
 from playslot_rl.methods.caddy.model import CADDY
@@ -154,7 +155,7 @@ def test_the_decoder_reads_the_labels_it_may_and_no_others(
     made = [behaviour(config, finished, replace(source, actions=given)) for given in (source.actions, hidden)]
     policies = [one.policy_stage() for one in made]
     stages = [decoder_stage(one, clone) for one, clone in zip(made, policies, strict=True)]
-    times = 2 if inputs == "both" else 1
+    times = (2 if inputs == "both" else 1) * (1 + len(DIRECTIONS))  # shifted frames, too
     assert [len(stage.targets) for stage in stages] == [times * (int(source.lengths[0]) - 1)] * 2
     assert torch.equal(stages[0].targets, stages[1].targets)
     assert torch.isfinite(stages[1].targets).all()
