@@ -51,14 +51,8 @@ def split(
     if not 0 <= seed <= LARGEST_DRAW:
         raise ConfigError(f"seed: got {seed}, expected a whole number from 0 to {LARGEST_DRAW}")
     target = Path(out)
-    for name, share in (fractions or {}).items():
-        if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:
-            raise DataError(
-                f"fractions: got {name}={share:g}, expected a plain name and a share of more than 0, at most 1"
-            )
-    total = 1.0 if fractions is None else sum(fractions.values())
-    if abs(total - 1) > 1e-6:
-        raise DataError(f"fractions: got a sum of {total:g}, expected 1, as in train=0.9,val=0.1")
+    if fractions is not None:
+        _require_shares(fractions)
     require_free(target, "--out ")
     contents = require_sound(root)
     if fractions is None:
@@ -71,6 +65,17 @@ def split(
             assemble([choose(contents, indices)], temporary / name, "playslot dataset split")
             made[name] = require_verified(temporary / name, [contents.root])
     return SplitResult(target, {name: tuple(indices) for name, indices in parts.items()}, made)
+
+
+def _require_shares(fractions: Mapping[str, float]) -> None:
+    for name, share in fractions.items():
+        if not name.replace("-", "").replace("_", "").isalnum() or not 0 < share <= 1:
+            raise DataError(
+                f"fractions: got {name}={share:g}, expected a plain name and a share of more than 0, at most 1"
+            )
+    total = sum(fractions.values())
+    if abs(total - 1) > 1e-6:
+        raise DataError(f"fractions: got a sum of {total:g}, expected 1, as in train=0.9,val=0.1")
 
 
 def by_task(tasks: Sequence[Sequence[str]], root: Path) -> dict[str, list[int]]:

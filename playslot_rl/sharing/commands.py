@@ -183,8 +183,10 @@ def rate_words(policy: SharedPolicyConfig) -> str:
     return f"{now}: one frame in {stride}{of}, and each action is held until the next"
 
 
-def _rollout(policy: SharedPolicyConfig) -> str:
-    return f" `lerobot-rollout` needs `--fps={policy.fps:g}`: its own is 30." if policy.fps else ""
+def _real(policy: SharedPolicyConfig, why: str) -> str:
+    """How a robot runs it, and why LeRobot has no simulator for it."""
+    told = f" `lerobot-rollout` needs `--fps={policy.fps:g}`: its own is 30." if policy.fps else ""
+    return REAL.format(why=why, camera=policy.camera, rate=rate_words(policy), told=told)
 
 
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
@@ -192,11 +194,11 @@ def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) 
     own, known = policy.env, experiment or ExperimentConfig()
     task_name = "/".join(filter(None, (own.name, own.task)))
     if own.name not in ENVIRONMENTS or own.id:  # LeRobot makes only tasks with a name
-        return REAL.format(why=NOWHERE, camera=policy.camera, rate=rate_words(policy), told=_rollout(policy))
+        return _real(policy, NOWHERE)
     task = task_config(task_name)
     alike = replace(own, image_size=task.image_size, frame_skip=task.frame_skip, max_steps=task.max_steps)
     if alike != task:
-        return REAL.format(why=CHANGED, camera=policy.camera, rate=rate_words(policy), told=_rollout(policy))
+        return _real(policy, CHANGED)
     acting = own.every(policy.stride)
     options = {
         "image_size": (own.image_size, 64),

@@ -114,7 +114,7 @@ def settings_section(given: ReportInput) -> Section:
         seeds = result["seeds"]
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
         drawn = result.get("render", {}).get("quality", given.config.render.quality)
-        how = f"at most {result.get('max_steps', given.config.acting.max_steps)} agent steps, rendering `{drawn}`"
+        how = f"at most {given.steps(result)} agent steps, rendering `{drawn}`"
         measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn, {how}"])
     return Section(
         "Settings and notes", [part.settings_table(model, task, measured), *(Text(note) for note in notes(given))]
@@ -157,8 +157,7 @@ PROBES = {"prototype": "from the slot's prototype", "latent": "from the slot's l
 def build_objects(given: ReportInput) -> Document:
     """All sections of the report on known objects; what is missing is named with its command."""
     config, grid = given.config, given.config.env.grid
-    result = json_or_nothing(given.run / RESULT) or None
-    result = result if result and given.measures(result) else None
+    result = given.measured(RESULT)
     seed = first_seed(config, config.seed) if result is None else int(result["seeds"][0])
     clips = generate(range(seed, seed + CLIPS_SHOWN), config.env.max_steps, config.env)
     sections = [

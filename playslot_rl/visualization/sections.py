@@ -77,13 +77,18 @@ class ReportInput:
     @cached_property
     def evaluations(self) -> dict[str, dict[str, Any]]:
         """Protocol -> `eval_info.json`, for those that are there and of the weights that the run has now."""
-        found = {name: json_or_nothing(self.run / "evaluation" / name / "eval_info.json") for name in PROTOCOLS}
-        return {name: one for name, one in found.items() if one and self.measures(one)}
+        found = {name: self.measured(Path("evaluation") / name / "eval_info.json") for name in PROTOCOLS}
+        return {name: one for name, one in found.items() if one}
 
-    def measures(self, result: dict[str, Any]) -> bool:
-        """Whether a result is of the weights that the run has now."""
+    def measured(self, path: Path) -> dict[str, Any] | None:
+        """A result below the run, if it is there and of the weights that the run has now."""
+        result = json_or_nothing(self.run / path)
         pairs = [(self.metas.get(s, {}).get("fingerprint"), of) for s, of in result.get("fingerprints", {}).items()]
-        return all(now in (None, of) for now, of in pairs)
+        return result if result and all(now in (None, of) for now, of in pairs) else None
+
+    def steps(self, result: Mapping[str, Any]) -> int:
+        """Agent steps of its episodes, at most."""
+        return int(result.get("max_steps", self.config.acting.max_steps))
 
     @property
     def first_seed(self) -> int:
@@ -136,7 +141,7 @@ def success_section(given: ReportInput) -> Section:
             cells.append([name, said, interval(result["ci95"]), taken, count])
         headers = ["", "success rate", "95 % interval", "mean steps to success", "episodes"]
         same = "the same seeds" if len(_by_seeds(results)) == 1 else "the seeds that are named"
-        lengths = {name: result.get("max_steps", given.config.acting.max_steps) for name, result in results.items()}
+        lengths = {name: given.steps(result) for name, result in results.items()}
         long = ", ".join(f"{steps} in {name}" for name, steps in lengths.items())
         unlike = f" Episodes differ in agent steps: {long}." if len({*lengths.values()}) > 1 else ""
         blocks.append(Table(headers, cells, f"Wilson intervals. References run closed-loop on {same}.{unlike}"))
@@ -147,7 +152,7 @@ def success_section(given: ReportInput) -> Section:
             if r["success_rate"] is not None
         ]
         alt = "; ".join(f"{n}: {percent(rate)}, {interval(list(ci))}" for n, rate, ci, _ in drawn)
-        steps = results.get("imagination", {}).get("max_steps", given.config.acting.max_steps)
+        steps = given.steps(results.get("imagination", {}))
         ways = (
             "Simulation: the agent sees every frame. Imagination: it sees the first frame only, unfolds "
             f"{steps} steps in latent space, and the decoded actions are then executed."
@@ -244,16 +249,15 @@ def slots_section(given: ReportInput, clip: Callable[[], Any], what: str = EXPER
     )
     picture = Picture("slots", png(draw_slots(given.world_model, clip())), alt, caption)
     blocks: list[Block] = [picture]
-    result = json_or_nothing(given.run / SLOTS_RESULT)
-    if result and not given.measures(result):
-        blocks.append(Missing("These slots have not been scored.", given.command("evaluate", "protocol=slots")))
-    elif result:
+    if result := given.measured(SLOTS_RESULT):
         scored = (
             f"On {result['episodes']} held-out episodes of the expert: FG-ARI {result['foreground_ari']:.2f} and ARI "
             f"{result['ari']:.2f} against the simulator's segmentation (1 is perfect, 0 chance), "
             f"{result['slots_per_object']:.1f} slots an object, reconstruction {result['psnr']:.1f} dB."
         )
         blocks.append(Text(scored))
+    elif (given.run / SLOTS_RESULT).is_file():
+        blocks.append(Missing("These slots have not been scored.", given.command("evaluate", "protocol=slots")))
     return Section(title, blocks)
 
 

@@ -133,8 +133,9 @@ def test_small_things_have_more_pixels_from_near(task: str) -> None:
     assert config.camera == NEAR
     near, far = (pixels(MetaWorldEnv(replace(config, camera=camera))) for camera in (NEAR, ""))
     assert max(far.values()) < max(near.values())
+    times = 1.5 if task == "push-back" else 1.6  # nine pixels, six from far
     for name, count in near.items():
-        assert count >= 1.5 * far[name] or (task == "soccer" and name == "goal"), "a marker in the net"
+        assert count >= times * far[name] or (task == "soccer" and name == "goal"), "a marker in the net"
 
 
 def test_a_camera_may_be_named_or_typed() -> None:

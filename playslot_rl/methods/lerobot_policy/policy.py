@@ -87,16 +87,18 @@ class ChunkPolicy(nn.Module):
         """ResNet-18 in it, and torchvision's name of each of its tensors."""
         raise NotImplementedError
 
-    def learn_norms(self) -> None:
-        """Have frozen BatchNorm layers learn, for a ResNet-18 that begins without ImageNet's statistics."""
+    def learn_norms(self) -> bool:
+        """Have frozen BatchNorm layers learn, for a ResNet-18 that begins without ImageNet's statistics; whether there
+        are any.
+        """
         from torchvision.ops import FrozenBatchNorm2d
 
-        for parent in list(self.modules()):
-            for name, child in parent.named_children():
-                if isinstance(child, FrozenBatchNorm2d):
-                    norm = nn.BatchNorm2d(len(child.weight), child.eps, device=child.weight.device)
-                    norm.num_batches_tracked = None  # so that they load into frozen ones, which act alike
-                    setattr(parent, name, norm)
+        frozen = [part for part in self.named_modules() if isinstance(part[1], FrozenBatchNorm2d)]
+        for name, layer in frozen:
+            norm = nn.BatchNorm2d(len(layer.weight), layer.eps, device=layer.weight.device)
+            norm.num_batches_tracked = None  # so that they load into frozen ones, which act alike
+            self.set_submodule(name, norm)
+        return bool(frozen)
 
     def loss(self, pixels: Tensor, actions: Tensor, pad: Tensor, states: Tensor | None = None) -> Tensor:
         """LeRobot's loss of frames (B, F, 3, W, W), chunks (B, H, A) in [-1, 1], where these are padding (B, H), and

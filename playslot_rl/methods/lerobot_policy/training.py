@@ -149,8 +149,7 @@ def training(record: StageRecord, state: bool = False) -> Training:
         policy = chunk_policy(own, config.env.image_size, width, chunk, 0 if states is None else states.shape[1])
     trunk, names = policy.trunk()
     pretraining = load_trunk(trunk, own.weights, f"{group}.weights", names)
-    if pretraining == "scratch":
-        policy.learn_norms()
+    learned = pretraining == "scratch" and policy.learn_norms()
     policy.give(real_actions(split.trained, moves.rows, width), states)
     policy.to(device)
     trained = chunked(config, split.trained, own, chunk, device, own.shift, state)
@@ -160,7 +159,7 @@ def training(record: StageRecord, state: bool = False) -> Training:
     stage = ChunkStage(policy, own, trained, held_out)
     facts: dict[str, Any] = {"pretraining": pretraining, "chunk": chunk}
     facts |= {"state": policy.state_dim} if state else {}
-    if pretraining == "scratch" and isinstance(own, ACTConfig):
+    if learned:
         facts["norms"] = "learned"  # a training of before, whose layers were frozen, does not go on
     part = Part(f"baselines.{record.name}", stage, own, group=group, optimizer=partial(_optimizer, policy, own))
     said = f", chunks of {chunk}, ResNet-18 from {pretraining}"
