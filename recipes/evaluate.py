@@ -1,6 +1,6 @@
 """`playslot evaluate run=DIR protocol=simulation|imagination|replay|slots episodes=N seed=S`: success of a policy.
 
-Writes `DIR/evaluation/PROTOCOL/eval_info.json` and renews `DIR/report.md` and `DIR/report.html`.
+Writes `DIR/evaluation/PROTOCOL/eval_info.json` and, after success of a PlaySlot run, `DIR/report.md` and `.html` anew.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def main(config: ExperimentConfig, report: bool = True) -> None:
 
     A pretrained policy (`run=pretrained/ENV`) is copied into `out`, which becomes a run like any other. A baseline's
     run (`method` in its config) is evaluated in simulation only. Where there is no simulator (GridShapes) its slots and
-    latent actions are scored instead: see `recipes.objects`. With `report` the run's report is renewed afterwards.
+    latent actions are scored instead: see `recipes.objects`. With `report` PlaySlot's is renewed after its success.
     """
     run = run_with_policy(config)
     if run.pretrained:

@@ -25,6 +25,7 @@ from playslot_rl.studies.success.jobs import (
     success_config,
     success_jobs,
     success_record,
+    world_parts,
     world_runs,
 )
 from playslot_rl.studies.success.measure import job_rows, task_results
@@ -75,6 +76,12 @@ def test_a_job_takes_the_model_and_the_shared_policy_of_its_own_number() -> None
     assert Path(own.behaviour.policy_from).name == "lapo-d100-l5-w2-s0"
     assert model_folder(OUT, "lapo_model") == OUT / "lapo_world"
     assert success_record(job, own, {})["world"] == 2
+
+
+def test_dynamics_are_asked_for_where_a_method_builds_on_them() -> None:
+    assert world_parts(["slot_bc", "slot_oracle", "lapo_slots", "sold", "resnet_bc"]) == ("slots",)
+    assert world_parts(["slot_bc", "playslot"]) == ("slots", "dynamics")
+    assert world_parts(["resnet_bc", "lapo", "act"]) == ()
 
 
 def test_world_models_are_named_by_run_and_runs() -> None:

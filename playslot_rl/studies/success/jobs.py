@@ -4,7 +4,7 @@ seed; and what they share, made once: demonstrations, videos, world models, othe
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from playslot_rl.evaluation.actions import require_unseen
 from playslot_rl.evaluation.held_out import held_out_seeds
 from playslot_rl.methods.training import of_recorded, train_model
 from playslot_rl.runs import Run
+from playslot_rl.storage.checkpoints import StageCheckpoint
 from playslot_rl.studies.launch import train
 from playslot_rl.studies.study import Job, absolute, absolute_roots, computed, fingerprint_of, job_config
 
@@ -139,6 +140,12 @@ def uses_slots(config: ExperimentConfig) -> bool:
     return any(METHODS[name].slots for name in config.compare.methods)
 
 
+def world_parts(methods: Iterable[str]) -> tuple[str, ...]:
+    """Stages of the world model that these methods build on: `slots` alone, or `dynamics` too."""
+    parents = {name for method in methods for stage in METHODS[method].stages for name in (stage.name, *stage.parents)}
+    return tuple(name for name in ("slots", "dynamics") if name in parents)
+
+
 def latent_models(config: ExperimentConfig) -> dict[str, str]:
     """Stages of the models of unlabelled videos that methods share, and for each of them a method that does."""
     return {model.name: name for name in config.compare.methods if (model := shared_model(config, name))}
@@ -243,7 +250,7 @@ def _recorded_elsewhere(config: ExperimentConfig) -> ExperimentConfig:
     source = split_demonstrations(open_videos(config, demos, "compare"), None, held, 0).held_out
     if source is not None and uses_slots(config):
         for run in filter(None, world_runs(config)):
-            require_unseen(source, Run.open(run).world_stages, held)
+            require_unseen(source, _parts(config, run), held)
     return config
 
 
@@ -281,8 +288,8 @@ def _world(config: ExperimentConfig, out: Path, number: int) -> str:
     if number < len(named):
         return named[number]
     model = str(numbered(out / "world_model", number))
-    for command in ("train-slots", "train-dynamics"):
-        train(command, replace(config, out=model, run="", seed=config.seed + number))
+    for stage in world_parts(config.compare.methods):
+        train(f"train-{stage}", replace(config, out=model, run="", seed=config.seed + number))
     return model
 
 
@@ -337,7 +344,7 @@ class Shared:
 
     def __init__(self, config: ExperimentConfig) -> None:
         runs = world_runs(config) if uses_slots(config) else ()
-        self._worlds = [(_source(run), Run.open(run).world_stages) for run in runs]
+        self._worlds = [(_source(run), _parts(config, run)) for run in runs]
         self._models = {
             stage: [Run(model_folder(Path(config.out), stage, n)).own(stage) for n in range(config.compare.worlds)]
             for stage in latent_models(config)
@@ -354,7 +361,7 @@ class Shared:
         """Fingerprints of the weights, by stage, and of the demonstrations that a job builds on."""
         method = METHODS[job.method]
         world = self._worlds[job.world][1] if method.slots else {}
-        prints = {name: stage.fingerprint for name, stage in world.items()}
+        prints = {name: world[name].fingerprint for name in world_parts((job.method,)) if name in world}
         if job.method in self._supervised:
             prints["videos"] = self._videos
         elif method.model:
@@ -381,6 +388,11 @@ class Shared:
             for name, stages in self._models.items()
         }
         return {"world_models": worlds, "latent_models": models}
+
+
+def _parts(config: ExperimentConfig, run: str) -> dict[str, StageCheckpoint]:
+    """Of a world model, what the methods build on."""
+    return {name: Run.open(run).stage(name) for name in world_parts(config.compare.methods)}
 
 
 def _source(run: str) -> str:

@@ -35,6 +35,7 @@ from playslot_rl.studies.success.jobs import (
     success_record,
     uses_demos,
     uses_slots,
+    world_parts,
     world_runs,
 )
 from playslot_rl.studies.success.page import success_page
@@ -234,7 +235,7 @@ def check_success(config: ExperimentConfig) -> None:
         check_method(config, method)
     task_results(config, [env.full_name])
     for run in world_runs(config) if uses_slots(config) else ():
-        for checkpoint in Run.open(run).world_stages.values() if run else ():
+        for checkpoint in map(Run.open(run).stage, world_parts(config.compare.methods)) if run else ():
             sizes = ("image_size",) if env.name in RECORDED else ("image_size", "action_dim")  # videos have no actions
             require_config(checkpoint, {"env": {key: getattr(env, key) for key in sizes}})
             trained = checkpoint.group(EnvConfig, "env")
