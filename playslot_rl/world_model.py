@@ -42,6 +42,7 @@ class WorldModel(nn.Module):
         self.config = config
         self.env = env
         self.savi = SAVi(config.savi, env.image_size)
+        _require_slots(config)
         self.inverse_dynamics = InverseDynamics(config.inverse_dynamics, config.savi.slot_dim, env.action_dim)
         self.predictor = build_predictor(
             config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim, self.inverse_dynamics.per_slot
@@ -74,6 +75,18 @@ class WorldModel(nn.Module):
         """([N,] Z): shape of one step's latent action."""
         width = self.inverse_dynamics.latent_dim
         return (self.config.savi.n_slots, width) if self.inverse_dynamics.per_slot else (width,)
+
+
+def _require_slots(config: ModelConfig) -> None:
+    """Refuse numbers of slots that are not there, or that say nothing, by a ConfigError."""
+    chosen, n = config.inverse_dynamics.slots, config.savi.n_slots
+    if chosen and max(chosen) > n:
+        raise ConfigError(f"model.inverse_dynamics.slots: got {max(chosen)}, expected at most the {n} slots of SAVi")
+    if chosen and config.savi.initial != "learned":
+        raise ConfigError(
+            "model.inverse_dynamics.slots: got some with model.savi.initial=gaussian, whose slots change places from "
+            "episode to episode, expected none, or a SAVi of initial=learned"
+        )
 
 
 class Agent(nn.Module):

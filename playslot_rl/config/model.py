@@ -105,6 +105,8 @@ class InverseDynamicsConfig(Checked):
         dead_threshold: EMA cluster size under which a code is revived by a random latent of the batch.
         commitment: weight beta of the commitment term.
         sample: sample z at evaluation too (training always samples).
+        slots: numbers, from 1 as in the pictures, of the slots whose change a latent action tells, of InvDyn_S; empty:
+            all. What moves by itself in the others, such as a distractor, is then no action.
     """
 
     group = "model.inverse_dynamics."
@@ -121,6 +123,13 @@ class InverseDynamicsConfig(Checked):
     dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
     commitment: float = field(default=0.25, metadata=NOT_NEGATIVE)
     sample: bool = False
+    slots: tuple[int, ...] = field(default=(), metadata=UNSAID | at_least(1, "numbers of slots from 1 on"))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        key, alone = f"{self.group}slots", not self.slots or self.variant == "single"
+        check(alone, key, self.slots, "none with variant=multi, which has a latent action for each slot")
+        check(len(set(self.slots)) == len(self.slots), key, self.slots, "each slot once")
 
 
 @dataclass(frozen=True)

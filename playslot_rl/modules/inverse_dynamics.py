@@ -3,6 +3,9 @@
     mu_t, var_t = f(S_t);   z_t ~ N(mu_{t+1} - mu_t, var_{t+1} + var_t);   p_t = VQ(z_t),  v_t = z_t - sg[p_t]
 
 Shapes: slots (B, T, N, D) -> z, p, v (B, T-1, Z) for InvDyn_S (one agent), (B, T-1, N, Z) for InvDyn_M (many).
+
+Note: the paper's InvDyn_S sees all slots. With `config.slots` f sees some of them, so that z says nothing of what moves
+by itself in the others (after Klepach et al., Object-Centric Latent Action Learning, 2025, who choose slots, too).
 """
 
 from __future__ import annotations
@@ -107,6 +110,8 @@ class InverseDynamics(nn.Module):
 
     def scene_dynamics(self, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the scene dynamics of each frame: slots (..., N, D) -> two of (..., [N,] Z)."""
+        if self.config.slots:
+            slots = slots[..., [number - 1 for number in self.config.slots], :]
         h = self.encoder(slots)
         with full_precision(slots.device.type):  # z is a difference of two means that are nearly equal
             h = h.to(slots.dtype)
