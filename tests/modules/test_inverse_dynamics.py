@@ -9,7 +9,10 @@ import pytest
 import torch
 
 from playslot_rl.config import InverseDynamicsConfig, LatentMode
+from playslot_rl.errors import ConfigError
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
+from playslot_rl.testing import tiny_config
+from playslot_rl.world_model import WorldModel
 
 D, Z, A = 12, 6, 4
 SMALL = InverseDynamicsConfig(latent_dim=Z, n_prototypes=5, dim=16, layers=2, heads=2, head_dim=8, mlp_dim=32)
@@ -39,6 +42,53 @@ def test_invdyn_s_does_not_depend_on_the_order_of_the_slots() -> None:
     torch.testing.assert_close(permuted.z, out.z)
     torch.testing.assert_close(permuted.prototype, out.prototype)
     assert torch.equal(permuted.code, out.code)
+
+
+def test_what_moves_in_slots_that_are_not_chosen_is_no_action() -> None:
+    torch.manual_seed(0)
+    invdyn = InverseDynamics(replace(SMALL, slots=(1, 3)), D, A).eval()
+    slots = clip()
+    expected, moved = invdyn(slots).mean, slots.clone()
+    moved[:, :, 1] = torch.randn(2, 5, D)
+    torch.testing.assert_close(invdyn(moved).mean, expected)
+    for chosen in (0, 2):
+        moved = slots.clone()
+        moved[:, :, chosen] = torch.randn(2, 5, D)
+        assert not torch.allclose(invdyn(moved).mean, expected, atol=1e-4)
+    torch.testing.assert_close(invdyn(slots[:, :, [2, 1, 0]]).mean, expected)
+
+
+@pytest.mark.parametrize(
+    ("slots", "variant", "said"),
+    [
+        ((1, 1), "single", "expected each slot once"),
+        ((0, 1), "single", "expected numbers of slots from 1 on"),
+        ((1,), "multi", "expected none with variant=multi"),
+    ],
+)
+def test_numbers_of_slots_that_say_nothing_are_refused(
+    slots: tuple[int, ...], variant: Literal["single", "multi"], said: str
+) -> None:
+    with pytest.raises(ValueError, match=f"model.inverse_dynamics.slots: got .*{said}"):
+        replace(SMALL, slots=slots, variant=variant)
+
+
+@pytest.mark.parametrize(
+    ("slots", "initial", "said"),
+    [((5,), "learned", "got 5, expected at most the 4 slots"), ((1,), "gaussian", "change places from episode")],
+)
+def test_slots_that_a_world_model_has_not_are_refused(
+    slots: tuple[int, ...], initial: Literal["gaussian", "learned"], said: str
+) -> None:
+    config = tiny_config()
+    model = config.model
+    sizes = replace(
+        model,
+        savi=replace(model.savi, initial=initial),
+        inverse_dynamics=replace(model.inverse_dynamics, slots=slots),
+    )
+    with pytest.raises(ConfigError, match=said):
+        WorldModel(sizes, config.env)
 
 
 def test_invdyn_m_gives_each_slot_its_own_latent_and_permutes_with_them() -> None:
