@@ -102,11 +102,10 @@ class InverseDynamicsConfig(Checked):
         n_prototypes: K.
         dim, layers, heads, head_dim, mlp_dim: transformer of InvDyn_S; `dim` is the hidden width of InvDyn_M.
         decay: EMA decay of the codebook.
-        dead_threshold: EMA cluster size under which a code is revived by a random latent of the batch.
+        dead_threshold: EMA cluster size under which a code is revived by a random latent.
         commitment: weight beta of the commitment term.
-        sample: sample z at evaluation too (training always samples).
-        slots: numbers, from 1 as in the pictures, of the slots whose change a latent action tells, of InvDyn_S; empty:
-            all. What moves by itself in the others, such as a distractor, is then no action.
+        sample: sample z at evaluation too.
+        slots: slots, counted from 1, whose change z tells; empty: all.
     """
 
     group = "model.inverse_dynamics."
