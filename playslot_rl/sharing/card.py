@@ -52,8 +52,11 @@ def make_card(
     agent: Agent,
     experiment: ExperimentConfig | None = None,
     results: Sequence[Result] = (),
+    world: ExperimentConfig | None = None,
 ) -> str:
-    """The card as Markdown with a YAML header: `card.md`, filled in."""
+    """The card as Markdown with a YAML header: `card.md`, filled in; `world` is the config of the world model's run,
+    where that is another one than the policy's.
+    """
     env = policy.env
     header = {
         "license": LICENCE,
@@ -65,9 +68,9 @@ def make_card(
     parameters = sum(p.numel() for part in shared_modules(agent).values() for p in part.parameters())
     commands = "Not recorded: saved from Python. `playslot export` writes the commands."
     if experiment:
-        lines = "\n".join(reproduce(experiment, policy.source, results))
+        lines = "\n".join(reproduce(experiment, policy.source, results, world))
         repeats = CLOCKED if policy.source.get("clocked") else REPEATS
-        commands = f"{places(experiment, policy.source)}```bash\n{lines}\n```\n\n{repeats}"
+        commands = f"{places(experiment, policy.source, world)}```bash\n{lines}\n```\n\n{repeats}"
     versions = {
         "exported with": _numbers(policy.source.get("versions", {})),
         "trained with": _numbers(policy.source.get("trained_with", {})),

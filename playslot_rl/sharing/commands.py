@@ -55,21 +55,28 @@ class Result:
     references: dict[str, tuple[float, tuple[float, float]]]
 
 
-def reproduce(config: ExperimentConfig, source: Mapping[str, Any], results: Sequence[Result]) -> list[str]:
-    """Command lines from nothing (from the data sets, where these were recorded elsewhere) to the evaluated policy."""
+def reproduce(
+    config: ExperimentConfig,
+    source: Mapping[str, Any],
+    results: Sequence[Result],
+    world: ExperimentConfig | None = None,
+) -> list[str]:
+    """Command lines from nothing (from the data sets, where these were recorded elsewhere) to the evaluated policy;
+    `world` is the config of its world model's run, where that is another one.
+    """
     evaluate = [
         _line("evaluate", f"run={RUN}", f"protocol={r.protocol}", f"episodes={r.episodes}", f"seed={r.seed}")
         for r in results
     ]
     made = _from_recordings if recorded_elsewhere(config, source) else _from_nothing
-    return [*made(config, source), *evaluate]
+    return [*made(config, source, world), *evaluate]
 
 
 def recorded_elsewhere(config: ExperimentConfig, source: Mapping[str, Any]) -> bool:
     return config.env.name in RECORDED or bool(source.get("recorded_elsewhere"))
 
 
-def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any]) -> list[str]:
+def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any], other: ExperimentConfig | None) -> list[str]:
     seed = source.get("seed")
     base, seeded = _base(config), _seeded(seed)
     changed, recorded, demos = changes(config, BEHAVIOUR), source.get("recorded") or {}, source.get("demos")
@@ -79,11 +86,11 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any]) -> list[s
         world = source.get("world_model_seed", seed)
         # Those that are held out the pipeline itself keeps apart.
         whole = demos is None or episodes in (demos, demos + config.data.held_out)
-        if world in (None, seed) and whole:
+        if other is None and world in (None, seed) and whole:
             return [_line("pipeline", *base, *seeded, *changes(config, GROUPS), f"out={RUN}")]
-        collected = f"data.demos={WORLD}/data/expert"
+        collected, first_run = f"data.demos={WORLD}/data/expert", other or config
         return [
-            _line("pipeline", *base, *_seeded(world), *changes(config, GROUPS), f"out={WORLD}"),
+            _line("pipeline", *_base(first_run), *_seeded(world), *changes(first_run, GROUPS), f"out={WORLD}"),
             _line("train-policy", f"run={WORLD}", *base, *seeded, *first, *changed, collected, f"out={RUN}"),
         ]
     count = [] if episodes is None else [f"episodes={episodes}"]
@@ -95,7 +102,7 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any]) -> list[s
     ]
 
 
-def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any]) -> list[str]:
+def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any], other: ExperimentConfig | None) -> list[str]:
     seed, data = source.get("seed"), config.data
     base, demos = _base(config), f"data.demos={DEMOS}"
     behaviour = [f"demos={config.demos}"] if config.demos is not None else []
@@ -103,16 +110,21 @@ def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any]) -> lis
     if source.get("shipped_world_model"):
         own = [*_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
         return [_line("train-policy", "run=pretrained", *base, *own, demos, f"out={RUN}")]
-    world, settings = source.get("world_model_seed", seed), [*changes(config, GROUPS), f"data.root={_videos(config)}"]
-    alike = world in (None, seed)
+    first, world, videos = other or config, source.get("world_model_seed", seed), _videos(config, other)
+    settings = [*changes(first, GROUPS), f"data.root={videos}"]
+    alike = other is None and world in (None, seed)
     if alike and config.env.name not in RECORDED:
         return [_line("pipeline", *base, *_seeded(seed), *behaviour, *settings, demos, f"out={RUN}")]
     folder = RUN if alike else WORLD
-    among = [demos, *behaviour] if DEMOS in _videos(config).split(",") else []
+    if other is not None:  # else the world model's run says them
+        own = [*base, *_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
+    else:
+        own = [*([] if alike else _seeded(seed)), *behaviour]
+    among = [demos, *behaviour] if DEMOS in videos.split(",") else []
     return [
-        _line("train-slots", *base, *_seeded(world), *settings, *among, f"out={folder}"),
+        _line("train-slots", *_base(first), *_seeded(world), *settings, *among, f"out={folder}"),
         _line("train-dynamics", f"run={folder}"),
-        _line("train-policy", f"run={folder}", *([] if alike else _seeded(seed)), *behaviour, demos, f"out={RUN}"),
+        _line("train-policy", f"run={folder}", *own, demos, f"out={RUN}"),
     ]
 
 
@@ -124,9 +136,9 @@ def _seeded(seed: int | None) -> list[str]:
     return [] if seed is None else [f"seed={seed}"]
 
 
-def _videos(config: ExperimentConfig) -> str:
-    """`data.root` with names that stand for its folders."""
-    roots, demos = data_roots(config.data.root), config.data.demos
+def _videos(config: ExperimentConfig, world: ExperimentConfig | None = None) -> str:
+    """`data.root`, that of the world model's run where it is another one, with names that stand for its folders."""
+    roots, demos = data_roots((world or config).data.root), config.data.demos
     names = [VIDEOS if len(roots) == 1 else f"{VIDEOS}_{number}" for number in range(1, len(roots) + 1)]
     named = [
         root._replace(path=DEMOS if root.path == demos and len(roots) > 1 else name)
@@ -147,6 +159,8 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
         group, _, name = key.rpartition(".")
         if not any(key.startswith(f"{one}.") for one in groups) or (group == "data" and key in machine | folders):
             continue
+        if key in machine & folders:
+            continue  # where a finished part was taken from
         # Where patience ends a stage, when it looks decides where.
         stage: Any = getattr(config, group, None)
         looks = name == "validate_every" and bool(getattr(stage, "patience", 0))
@@ -162,13 +176,14 @@ def _line(command: str, *arguments: str) -> str:
     return shlex.join(["playslot", command, *arguments])
 
 
-def places(config: ExperimentConfig, source: Mapping[str, Any]) -> str:
+def places(config: ExperimentConfig, source: Mapping[str, Any], world: ExperimentConfig | None = None) -> str:
     """What the folders in the commands stand for, a paragraph; empty where the commands make them."""
     if not recorded_elsewhere(config, source):
         return ""
     adopt = f"; `playslot adopt data.root={VIDEOS} out={RUN}` would choose sizes and steps anew"
+    videos = _videos(config, world).replace(",", "`, `")
     return (
-        f"`{_videos(config).replace(',', '`, `')}` and `{DEMOS}` stand for the data sets, recorded elsewhere, whose "
+        f"`{videos}` and `{DEMOS}` stand for the data sets, recorded elsewhere, whose "
         f"fingerprints are above{adopt if config.env.name == 'video' else ''}.\n\n"
     )
 

@@ -151,7 +151,11 @@ def _card(
 ) -> Callable[[SharedPolicyConfig], str]:
     results = read_results(run, config, source)
     made = replace(config, data=replace(config.data, camera=run.view.camera))  # one of several may be exported
-    return lambda written: make_card(name, written, agent, made, results)
+    home, world = run.world_run, None
+    if home is not run and not home.pretrained:
+        with contextlib.suppress(ConfigError):  # of an earlier version, or gone: the policy's own settings are said
+            world = home.config
+    return lambda written: make_card(name, written, agent, made, results, world)
 
 
 def renew_exported(run: Run, folder: Path, config: ExperimentConfig, source: dict[str, Any]) -> bool:

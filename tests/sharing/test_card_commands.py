@@ -241,6 +241,30 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
     assert "/home/me" not in str(commands)
 
 
+@pytest.mark.parametrize(
+    ("typed", "commands"),
+    [
+        (["env=block_push_easy", "env.variation.object=true"], ["pipeline", "train-policy"]),
+        (["env=video", "data.demos=/home/me/b"], ["train-slots", "train-dynamics", "train-policy"]),
+    ],
+)
+def test_the_world_model_of_another_run_is_made_by_that_runs_settings(typed: list[str], commands: list[str]) -> None:
+    given = "behaviour.policy_from=/home/me/copied"
+    config = compose(["preset=smoke", *typed, "data.root=/home/me/b", "behaviour.labelled_demos=2", given])
+    own = ["model.inverse_dynamics.slots=[1,2]", "slots.steps=7", "data.stride=2", "data.root=/home/me/a,/home/me/b"]
+    world, source = compose(["preset=smoke", *typed, *own]), policy_of()[1]
+    made = [shlex.split(line)[1:] for line in reproduce(config, source, [], world)]
+    assert [command for command, *_ in made] == commands
+    first, last = made[0], made[-1]
+    assert {*own[:3], "out=runs/world"} <= {*first}
+    assert not {*own[:3]} & {*last}
+    assert {"run=runs/world", "out=runs/again", "behaviour.labelled_demos=2"} <= {*last} | {*first}
+    assert "behaviour.labelled_demos=2" not in first
+    assert ("data.root=data/videos_1,data/demonstrations" in first) == (commands[0] == "train-slots")
+    assert "/home/me" not in str(made)
+    assert "policy_from" not in str(made)
+
+
 def test_every_environment_with_a_preset_is_of_some_kind() -> None:
     assert {compose(typed).env.name for typed, _ in KINDS.values()} == {*choices("env")} - {*PROCEDURAL}
     assert {*RECORDED, *ENVIRONMENTS, *PROCEDURAL} == {*choices("env")}
@@ -308,6 +332,13 @@ def on_the_shipped(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
     return Path("runs/first"), Path("runs/first/data/expert"), ()
 
 
+def on_anothers_world(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
+    smoke("pipeline", "env=block_push_easy", "out=runs/other", "seed=3", "slots.steps=5")
+    demos = "data.demos=runs/other/data/expert"
+    smoke("train-policy", "run=runs/other", demos, "behaviour.labelled_demos=1", "seed=3", "out=runs/first")
+    return Path("runs/first"), Path("runs/other/data/expert"), ()
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(
@@ -316,6 +347,7 @@ def on_the_shipped(tmp: Path) -> tuple[Path, Path, tuple[str, ...]]:
         (adopted, ["train-slots", "train-dynamics", "train-policy"]),
         (of_two_cameras, ["train-slots", "train-dynamics", "train-policy"]),
         (on_the_shipped, ["lerobot-eval", "collect", "train-policy", "evaluate", "evaluate"]),
+        (on_anothers_world, ["lerobot-eval", "pipeline", "train-policy"]),
     ],
 )
 def test_the_card_of_another_kind_of_run_can_be_followed(
@@ -327,7 +359,7 @@ def test_the_card_of_another_kind_of_run_can_be_followed(
     monkeypatch.chdir(tmp_path)
     run, data, chosen = made(tmp_path)
     card = exported(run, tmp_path / "policy", *chosen)
-    if "collect" not in names:
+    if not {"collect", "pipeline"} & {*names}:
         for name in ("videos", "demonstrations"):
             shutil.copytree(data, tmp_path / "data" / name)
     if made in (adopted, of_two_cameras):
