@@ -237,7 +237,8 @@ def test_from_nothing_data_and_world_model_are_made_once(tmp_path: Path, started
     done = playslot(*command)
     assert (done.code, done.err) == (0, "")
     assert {path.name for path in (out / "data").iterdir() if path.is_dir()} == {"expert", "random"}
-    assert (out / "world_model" / "dynamics" / "checkpoint").is_dir()
+    assert (out / "world_model" / "slots" / "checkpoint").is_dir()
+    assert not (out / "world_model" / "dynamics").exists()  # none of these builds on it
     assert (out / "lapo_world" / "lapo_model" / "checkpoint").is_dir()
     assert (out / "caddy_world" / "caddy" / "checkpoint").is_dir()
     assert [world["source"] for world in _result(out)["world_models"]] == ["world_model"]

@@ -357,7 +357,7 @@ def test_two_trainings_of_two_processes_each_run_side_by_side(finished: Path, tm
     assert (done.code, done.err) == (0, ""), (out / "jobs" / "launcher.log").read_text()
     assert {job["status"] for job in result(out)["jobs"]} == {"done"}
     alone = tmp_path / "alone"
-    given = ("processes=2", "threads=1", "device=cpu", "preset=smoke")  # `smoke` gives the last three
+    given = ("processes=2", "threads=1", "device=cpu")  # `smoke` gives the last two
     smoke(*(word.replace(str(out), str(alone)) for word in command if word not in given))
     for one, two in zip(result(alone)["summary"], result(out)["summary"], strict=True):
         assert one["title"] == two["title"]

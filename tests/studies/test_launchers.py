@@ -13,6 +13,7 @@ import pytest
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.studies import launch
 from playslot_rl.studies.launch import Status, log_file, write_status
+from playslot_rl.studies.video.jobs import VideoJob
 
 SBATCH = """#!/bin/bash
 # Runs the array's tasks here, side by side, with the variables that Slurm sets.
@@ -37,12 +38,15 @@ printf 'JobID|State|NodeList\\n4242_0|RUNNING|node1\\n4242_1|RUNNING|node1\\n'
 @pytest.fixture
 def jobs(tmp_path: Path) -> list[Path]:
     """Two jobs that were done before: each starts, sees it, and ends."""
-    files = [tmp_path / "out" / "jobs" / f"lapo-d{demos}-s0.json" for demos in (10, 50)]
-    files[0].parent.mkdir(parents=True)
-    for file in files:
-        file.write_text(json.dumps({"name": file.stem, "fingerprint": "f"}))
-        write_status(file, Status("done", "f"))
-    return files
+    made = [VideoJob("svg", seed, tmp_path / "out") for seed in (0, 1)]
+    for job in made:
+        job.file.parent.mkdir(parents=True, exist_ok=True)
+        record = {"name": job.name, "fingerprint": "f", "kind": "video", "method": "svg", "seed": job.seed}
+        job.file.write_text(json.dumps(record | {"out": str(job.out), "variant": ""}))
+        write_status(job.file, Status("done", "f"))
+        job.scores.parent.mkdir(parents=True)
+        job.scores.write_text(json.dumps({"fingerprint": "f"}))
+    return [job.file for job in made]
 
 
 def sweep(files: list[Path], launcher: str, *overrides: str) -> None:
