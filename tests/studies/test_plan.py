@@ -180,7 +180,7 @@ def test_a_world_model_is_of_its_tasks_alone(
     trained: EnvConfig, its: str, another: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint = SimpleNamespace(group=lambda *_: trained)
-    monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(world_stages={"slots": checkpoint}))
+    monkeypatch.setattr(measure.Run, "open", lambda _: SimpleNamespace(stage=lambda _: checkpoint))
     monkeypatch.setattr(measure, "require_config", lambda *_: None)
     given = [f"env={trained.name}", "run=trained", "methods=playslot", "data.demos=demos"]
     check_success(compared(*given, its))
