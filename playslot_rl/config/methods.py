@@ -94,9 +94,15 @@ class Method:
         return bool({"behaviour", "behaviour.labelled_demos"} & {*self.last.settings})
 
     @cached_property
+    def world(self) -> tuple[str, ...]:
+        """Stages of a world model that it builds on: `slots`, or `dynamics` too, or none."""
+        used = {name for stage in self.stages for name in (stage.name, *stage.parents)}
+        return tuple(name for name in ("slots", "dynamics") if name in used)
+
+    @property
     def slots(self) -> bool:
         """Whether it builds on a world model's slots."""
-        return any("slots" in (stage.name, *stage.parents) for stage in self.stages)
+        return "slots" in self.world
 
     @property
     def model(self) -> StageSpec | None:

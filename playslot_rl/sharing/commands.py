@@ -107,18 +107,16 @@ def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any], other:
     base, demos = _base(config), f"data.demos={DEMOS}"
     behaviour = [f"demos={config.demos}"] if config.demos is not None else []
     behaviour += [f"data.held_out={data.held_out}"] if data.held_out else []
+    own = [*base, *_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
     if source.get("shipped_world_model"):
-        own = [*_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
-        return [_line("train-policy", "run=pretrained", *base, *own, demos, f"out={RUN}")]
+        return [_line("train-policy", "run=pretrained", *own, demos, f"out={RUN}")]
     first, world, videos = other or config, source.get("world_model_seed", seed), _videos(config, other)
     settings = [*changes(first, GROUPS), f"data.root={videos}"]
     alike = other is None and world in (None, seed)
     if alike and config.env.name not in RECORDED:
         return [_line("pipeline", *base, *_seeded(seed), *behaviour, *settings, demos, f"out={RUN}")]
     folder = RUN if alike else WORLD
-    if other is not None:  # else the world model's run says them
-        own = [*base, *_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
-    else:
+    if other is None:  # the world model's run says the rest
         own = [*([] if alike else _seeded(seed)), *behaviour]
     among = [demos, *behaviour] if DEMOS in videos.split(",") else []
     return [
@@ -157,10 +155,10 @@ def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
     found = []
     for key, value in flatten(to_dict(config)).items():
         group, _, name = key.rpartition(".")
-        if not any(key.startswith(f"{one}.") for one in groups) or (group == "data" and key in machine | folders):
+        # A folder of one invocation, such as `behaviour.policy_from`, is where a finished part was taken from.
+        unsaid = machine | folders if group == "data" else machine & folders
+        if not any(key.startswith(f"{one}.") for one in groups) or key in unsaid:
             continue
-        if key in machine & folders:
-            continue  # where a finished part was taken from
         # Where patience ends a stage, when it looks decides where.
         stage: Any = getattr(config, group, None)
         looks = name == "validate_every" and bool(getattr(stage, "patience", 0))

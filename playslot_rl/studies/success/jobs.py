@@ -141,9 +141,9 @@ def uses_slots(config: ExperimentConfig) -> bool:
 
 
 def world_parts(methods: Iterable[str]) -> tuple[str, ...]:
-    """Stages of the world model that these methods build on: `slots` alone, or `dynamics` too."""
-    parents = {name for method in methods for stage in METHODS[method].stages for name in (stage.name, *stage.parents)}
-    return tuple(name for name in ("slots", "dynamics") if name in parents)
+    """Stages of the world model that these methods build on, those of all, `slots` first."""
+    used = {name for method in methods for name in METHODS[method].world}
+    return tuple(sorted(used, key=("slots", "dynamics").index))
 
 
 def latent_models(config: ExperimentConfig) -> dict[str, str]:
@@ -360,8 +360,7 @@ class Shared:
     def parents(self, job: SuccessJob) -> dict[str, str]:
         """Fingerprints of the weights, by stage, and of the demonstrations that a job builds on."""
         method = METHODS[job.method]
-        world = self._worlds[job.world][1] if method.slots else {}
-        prints = {name: world[name].fingerprint for name in world_parts((job.method,)) if name in world}
+        prints = {name: self._worlds[job.world][1][name].fingerprint for name in method.world}
         if job.method in self._supervised:
             prints["videos"] = self._videos
         elif method.model:
