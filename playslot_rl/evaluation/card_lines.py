@@ -86,6 +86,12 @@ MEASURES: Final[Mapping[str, Measure]] = {
     "noise_probe": Measure(
         ACTIONS, "control: recovered from such a noise latent (R²)", (0.1, 0.3), bad=": the latent tells the scene"
     ),
+    "telling_slots": Measure(
+        ACTIONS,
+        "share of the slots' change that is of slots whose change tells of the action",
+        (0.6, 0.3),
+        bad=": most of what changes is no action, and latents take it in",
+    ),
     "replay": Measure(
         EFFECTS, "latents replayed from their own frame: the slots move as they did (correlation)", (0.7, 0.3)
     ),
@@ -182,6 +188,7 @@ NEEDS: Final[Mapping[str, tuple[tuple[str, ...], ...]]] = {
     "shuffled_probe": (PROBES,),
     "noise_size": CARRIED,
     "noise_probe": (PROBES,),
+    "telling_slots": (SEEN,),
     "replay": APART,
     "transfer": (("replay",),),
     "transfer_shuffled": (("transfer",),),

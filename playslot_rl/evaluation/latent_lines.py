@@ -1,10 +1,12 @@
-"""The card's lines on latents: how many kinds and directions, how much of the real action they carry, with controls.
+"""The card's lines on latents: how many kinds and directions, how much of the real action they carry, with controls,
+and whether what changes in the slots is of the action at all.
 
 Shapes: M transitions, Z latent-action width (N * Z with one latent per slot), A action width, N slots, D slot width.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,8 +17,17 @@ import torch
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.windows import spread_windows
 from playslot_rl.evaluation.card_lines import ACTIONS, MEASURES, NO_LATENTS, UNTOLD, Line, line
-from playslot_rl.evaluation.probes import Floats, Ints, codebook_usage, participation_ratio, probe_actions, repaired
+from playslot_rl.evaluation.probes import (
+    Floats,
+    Ints,
+    codebook_usage,
+    linear_probe,
+    participation_ratio,
+    probe_actions,
+    repaired,
+)
 from playslot_rl.frames import normalise
+from playslot_rl.modules.inverse_dynamics import InverseDynamics
 from playslot_rl.seeds.draws import derived_seed, step_generator
 from playslot_rl.world_model import WorldModel, module_device
 
@@ -103,6 +114,7 @@ def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[
         missing = "latents are the real actions (mode ground_truth)"
     lines: dict[str, Line] = {}
     scores: dict[str, Any] = {}
+    slots: list[dict[str, Any]] = []
     if not missing:
         noisy = noise_latents(model, parsed, seed)
         lines["noise_size"] = _noise_size(noisy[parsed.tested], parsed.latents[parsed.tested])
@@ -115,10 +127,14 @@ def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[
         else:
             known = np.asarray(np.isfinite(parsed.actions).all(axis=1))
             of = "" if known.all() else f"; {known.sum()} of {len(known)} transitions have actions"
-            missing, scores = _scores(parsed.take(known), noisy[known], seed)
-            lines |= _probe_lines(scores, of) if scores else {}
+            acted = parsed.take(known)
+            missing, scores = _scores(acted, noisy[known], seed)
+            if scores:
+                slots = telling_slots(acted)
+                lines |= _probe_lines(scores, of) | {"telling_slots": _telling_line(model.inverse_dynamics, slots)}
     keys = [key for key, measure in MEASURES.items() if measure.group == ACTIONS]
-    return [lines.get(key) or line(key, None, missing) for key in keys], {"probes": scores}
+    details = {"probes": scores} | ({"telling_slots": slots} if slots else {})
+    return [lines.get(key) or line(key, None, missing) for key in keys], details
 
 
 def _scores(parsed: ParsedEpisodes, noisy: Floats, seed: int) -> tuple[str, dict[str, Any]]:
@@ -166,6 +182,39 @@ def _probe_lines(scores: dict[str, Any], of: str) -> dict[str, Line]:
         "shuffled_probe": line("shuffled_probe", best["shuffled"], "the better of both probes"),
         "noise_probe": line("noise_probe", best["noise"], "the better of both probes"),
     }
+
+
+def telling_slots(parsed: ParsedEpisodes) -> list[dict[str, Any]]:
+    """Of each slot its number, from 1, `change`, its share of the squared change of all slots in a transition, and
+    `r2`, what a linear probe tells of the action from its change alone; None where the tested actions hardly vary.
+    """
+    actions, tested = parsed.actions, parsed.tested
+    if actions is None:
+        return []
+    change = parsed.slots[parsed.rows + 1] - parsed.slots[parsed.rows]
+    size = np.square(change, dtype=np.float64).sum((0, 2))
+    return [
+        {
+            "slot": n + 1,
+            "change": float(size[n] / max(size.sum(), 1e-12)),
+            "r2": linear_probe(change[~tested, n], actions[~tested], change[tested, n], actions[tested])["mean_r2"],
+        }
+        for n in range(change.shape[1])
+    ]
+
+
+def _telling_line(model: InverseDynamics, slots: Sequence[Mapping[str, Any]]) -> Line:
+    """Of the change that the latents see, how much is in slots that tell of the action; which slots to choose."""
+    chosen = model.config.slots
+    seen = [one for one in slots if not chosen or one["slot"] in chosen]
+    telling = [one for one in seen if one["r2"] > NOTHING]
+    told = ", ".join(f"{one['slot']} ({one['r2']:.2f})" for one in telling) or "none"
+    share = sum(one["change"] for one in telling) / max(sum(one["change"] for one in seen), 1e-12)
+    found = line("telling_slots", share, f"slots that tell, with their R²: {told}")
+    if found.verdict == "good" or not telling or len(telling) == len(seen) or model.per_slot:
+        return found
+    numbers = ",".join(str(one["slot"]) for one in telling)
+    return replace(found, note=f"{found.note}; model.inverse_dynamics.slots=[{numbers}] leaves out the others")
 
 
 def _noise_size(noisy: Floats, real: Floats) -> Line:

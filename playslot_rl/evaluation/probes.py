@@ -103,6 +103,13 @@ def probe_actions(
     return result
 
 
+def linear_probe(x: Floats, y: Floats, x_test: Floats, y_test: Floats) -> dict[str, Any]:
+    """Ridge regression of actions y (M, A) from features x (M, D), tested on other rows: `r2` and `mean_r2` as of
+    `probe_actions`.
+    """
+    return _score("linear", x, y, x_test, y_test)
+
+
 def _score(kind: str, x: Floats, y: Floats, x_test: Floats, y_test: Floats) -> dict[str, Any]:
     import warnings
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from playslot_rl.evaluation.card import RESULT, Card
-from playslot_rl.evaluation.card_lines import EFFECTS, LATENTS, SLOTS, concluded
+from playslot_rl.evaluation.card_lines import ACTIONS, EFFECTS, LATENTS, SLOTS, concluded
 from playslot_rl.evaluation.effects import Replayed
 from playslot_rl.frames import png
 from playslot_rl.storage.atomic import json_or_nothing
@@ -67,7 +67,7 @@ def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> D
 
 def _pictures(card: Card, model: WorldModel) -> dict[str, list[Block]]:
     """Pictures by the group that they belong to."""
-    found: dict[str, list[Block]] = {LATENTS: [], EFFECTS: [], SLOTS: []}
+    found: dict[str, list[Block]] = {LATENTS: [], ACTIONS: _slot_table(card), EFFECTS: [], SLOTS: []}
     counts = card.details.get("code_counts")
     if counts:
         alt = f"Share of transitions by code: {', '.join(map(str, counts))}."
@@ -144,6 +144,15 @@ def _prototype_table(table: Sequence[Mapping[str, Any]]) -> list[Block]:
     caption = "The slot that a held prototype moves most on average, how far (pixels), and how far places differ."
     headers = ["prototype", "moves most", "mean displacement", "standard deviation"]
     return [Table(headers, rows, caption)] if rows else []
+
+
+def _slot_table(card: Card) -> list[Block]:
+    rows = [
+        [f"slot {one['slot']}", f"{one['change']:.0%}", f"{one['r2'] + 0.0:.2f}"]
+        for one in card.details.get("telling_slots", [])
+    ]
+    caption = "How much of the slots' change is each one's, and what that alone tells of the action."
+    return [Table(["slot", "share of the change", "R² of the action"], rows, caption)] if rows else []
 
 
 def _videos(given: ReportInput) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from typing import Any
@@ -103,6 +104,32 @@ def test_latents_of_noise_recover_nothing(model: WorldModel, card: Card) -> None
     lines = by_key(action_lines(model, replace(card.parsed, latents=noise), 0)[0])
     assert lines["linear_probe"].verdict == lines["mlp_probe"].verdict == "bad"
     assert lines["above_frame"].verdict != "good"
+
+
+@pytest.mark.parametrize(
+    ("chosen", "verdict", "share"), [((), "bad", 0.04), ((1, 2), "good", 1.0), ((2, 3), "bad", 0.02)]
+)
+def test_a_slot_that_moves_by_itself_is_told_from_those_that_the_robot_moves(
+    model: WorldModel, card: Card, chosen: tuple[int, ...], verdict: str, share: float
+) -> None:
+    parsed, generator = card.parsed, np.random.default_rng(0)
+    assert parsed.actions is not None
+    frames, n, width = parsed.slots.shape
+    moved = parsed.actions @ generator.normal(size=(4, width)).astype(np.float32)
+    change = np.stack([moved, moved[:, ::-1], 7 * generator.normal(size=moved.shape) * moved.std()], 1)
+    change = np.append(change, np.zeros((len(change), n - 3, width)), 1)
+    slots = np.zeros((frames, n, width))
+    for row, by in zip(parsed.rows, change, strict=True):  # an episode's first frame has slots of zero
+        slots[row + 1] = slots[row] + by
+    own = copy.deepcopy(model)
+    own.inverse_dynamics.config = replace(own.inverse_dynamics.config, slots=chosen)
+    found, details = action_lines(own, replace(parsed, slots=slots.astype(np.float32)), 0)
+    line = by_key(found)["telling_slots"]
+    assert line.verdict == verdict
+    assert line.value == pytest.approx(share, abs=0.01)
+    assert ("model.inverse_dynamics.slots=[1,2] leaves out" in line.note) == (chosen == ())
+    assert [round(one["r2"]) for one in details["telling_slots"]] == [1, 1, *[0] * (n - 2)]
+    assert sum(one["change"] for one in details["telling_slots"]) == pytest.approx(1)
 
 
 def test_actions_that_are_no_numbers_are_counted(model: WorldModel, card: Card) -> None:
