@@ -263,7 +263,9 @@ class _Run:
         a_step = (state.seconds - spent - self._validating) / (state.step - done)
         a_step += self._validation / self.config.validate_every
         planned = pace.steps(state.step, state.seconds, a_step, self.planned, self._validation)
-        self.state, self._looked, self._validating = replace(state, planned=planned), (state.step, state.seconds), 0.0
+        if planned != self.planned:  # stays told where a later look takes it back: the rate went another way meanwhile
+            self.state = replace(state, planned=planned)
+        self._looked, self._validating = (state.step, state.seconds), 0.0
 
     def _step(self, step: int) -> dict[str, Tensor | float]:
         rate = learning_rate(self.config.optim, step, self.planned)

@@ -145,7 +145,7 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
         metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}
         modules |= part.stage.modules
         steps, seconds = steps or state.step, seconds + state.seconds
-        clocked = clocked or state.planned not in (0, part.config.steps)
+        clocked = clocked or state.planned != 0
         sittings += sittings_of(record.folder / part.folder / "checkpoints", part.name)
     extra = {**training.extra, "sittings": sittings, **({"clocked": True} if clocked else {})}
     done = record.save(modules, metrics, steps, seconds, extra)

@@ -92,6 +92,7 @@ def rates(folder: Path) -> list[float]:
         ({0: 20.0}, 0.0, 5, 5),
         ({0: 0.5}, 5.0, 92, 100),  # what is between the steps counts
         ({0: 0.25}, 0.0, 380, 400),
+        ({0: 4.0, 10: 0.66}, 0.0, 100, 100),  # as planned in the end, by another way
     ],
 )
 def test_a_training_keeps_to_its_time(
@@ -106,6 +107,8 @@ def test_a_training_keeps_to_its_time(
     assert len(learning) == state.step
     assert learning[0] == 1.0
     assert learning[-1] < 0.1, "the schedule ends with the training"
+    trained(Slow(clock, {0: 1.0}), tmp_path / "plain", None)
+    assert (state.planned != 0) == (learning != rates(tmp_path / "plain")), "only so a card knows"
 
 
 def test_it_has_a_least_number_of_steps_and_without_a_pace_all(clock: Clock, tmp_path: Path) -> None:
