@@ -7,7 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from playslot_rl.data.cache import cache_folder
 from playslot_rl.data.contents import Contents
+from playslot_rl.data.prints import episode_origins
+from playslot_rl.data.source import labels_of
+from playslot_rl.data.views import say_shared
 from playslot_rl.datasets.assemble import assemble, choose
 from playslot_rl.datasets.verify import Verification, require_sound, require_verified
 from playslot_rl.errors import DataError
@@ -48,11 +52,20 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
     contents = [require_sound(folder) for folder in folders]
     for other in contents[1:]:
         require_same_kind(contents[0], other)
+    say_doubles(contents)
     with new_folder(target, key="--out ") as temporary:
         choices = [choose(each, [span.index for span in each.spans]) for each in contents]
         assemble(choices, temporary, "playslot dataset merge")
         result = require_verified(temporary, folders)
     return MergeResult(target, tuple((c.root, len(c.spans)) for c in contents), result)
+
+
+def say_doubles(contents: Sequence[Contents]) -> None:
+    """Say which data sets have episodes of an earlier one."""
+    origins = [episode_origins(each, labels_of(each)["actions"], cache_folder()) for each in contents]
+    for place, (each, own) in enumerate(zip(contents, origins, strict=True)):
+        for other, others in zip(contents[:place], origins, strict=False):
+            say_shared(each.name, own, other.name, others)
 
 
 def require_same_kind(first: Contents, other: Contents) -> None:

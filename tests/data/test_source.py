@@ -109,12 +109,16 @@ def test_the_data_set_is_left_untouched(foreign_images: Path, tmp_path: Path) ->
         open_sources(foreign_images, cache=foreign_images / "cache")
 
 
-def test_several_data_sets_are_read_as_one(foreign_images: Path, damaged: Path, tmp_path: Path) -> None:
+def test_several_data_sets_are_read_as_one(
+    foreign_images: Path, damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(DataError, match=r"got the frames of .* twice"):
         open_sources(f"{foreign_images}, {damaged}", cache=tmp_path / "cache")
     with (damaged / "meta" / "info.json").open("a") as info:
         info.write("\n")
     both = open_sources(f"{foreign_images}, {damaged}", cache=tmp_path / "cache")
+    doubles = f"note: {damaged}: 3 of its 3 episodes have actions of {foreign_images}'s, and count twice"
+    assert doubles in capsys.readouterr().err
     frames = np.concatenate(foreign_frames())
     assert isinstance(both.frames, RowView)
     assert both.frames.shape == (30, 32, 32, 3)

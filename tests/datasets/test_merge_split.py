@@ -81,10 +81,13 @@ def test_merged_videos_are_not_encoded_again(kind: str, request: pytest.FixtureR
 
 
 @pytest.mark.integration
-def test_a_merged_set_can_be_resumed_and_merged_again(images: Path, other: Path, tmp_path: Path) -> None:
+def test_a_merged_set_can_be_resumed_and_merged_again(
+    images: Path, other: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     merge([images, other], tmp_path / "all")
+    assert "count twice" not in capsys.readouterr().err
     more = LeRobotDataset.resume("me/all", root=tmp_path / "all")
     for _ in range(2):
         more.add_frame({CAMERA: np.zeros((32, 32, 3), np.uint8), "action": np.zeros(2, np.float32), "task": "rest"})
@@ -92,6 +95,8 @@ def test_a_merged_set_can_be_resumed_and_merged_again(images: Path, other: Path,
     more.finalize()
     assert verify(tmp_path / "all").errors == ()
     assert merge([tmp_path / "all", images], tmp_path / "more").verification.episodes == 9
+    told = f"note: {images}: 3 of its 3 episodes have actions of {tmp_path / 'all'}'s, and count twice"
+    assert told in capsys.readouterr().err
 
 
 @pytest.mark.integration
