@@ -107,6 +107,9 @@ def of_the_page() -> dict[str, list[Line]]:
     for row in (row for row in rows if len(row) == 1 + len(names) and row[0].strip(" `") in MEASURES):
         key = row[0].strip(" `")
         for name, cell in zip(names, row[1:], strict=True):
+            if not cell.strip():
+                cards[name].append(line(key, None, "not measured there"))
+                continue
             value, verdict = cell.split()
             told: Any = verdict.lower()  # a value at a border was rounded
             cards[name].append(replace(line(key, float(value)), verdict=told))
