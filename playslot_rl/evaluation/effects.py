@@ -234,8 +234,7 @@ def effect_lines(
     shown = Replayed(windows, start, true, own, taken, swapped)
     if not model.inverse_dynamics.latent_dim:
         return [line(key, None, NO_LATENTS) for key, m in MEASURES.items() if m.group == EFFECTS], {}, shown
-    moved = displacements(start.labels, true.labels, n)
-    lines, details = transfer_lines(shown, moved, n)
+    lines, details = transfer_lines(shown, n, told_slots(model))
     constancy, held, table = _constancy(model, windows, used)
     sensitivity, region = _sensitivity(shown, details["moving_slots"])
     details |= {"prototypes": table, "steps": windows.latents.shape[1], "windows": len(first)}
@@ -243,16 +242,23 @@ def effect_lines(
     return [*lines, constancy, *sensitivity], details, shown
 
 
-def transfer_lines(shown: Replayed, moved: npt.NDArray[np.float64], n: int) -> tuple[list[Line], dict[str, Any]]:
+def told_slots(model: WorldModel) -> list[int]:
+    """The slots whose change latents tell, from 0: what moves by itself in the others is not theirs to repeat."""
+    return [number - 1 for number in model.config.inverse_dynamics.slots] or list(range(model.slot_shape[0]))
+
+
+def transfer_lines(shown: Replayed, n: int, told: list[int]) -> tuple[list[Line], dict[str, Any]]:
+    moved = displacements(shown.start.labels, shown.true.labels, n)[:, told]
     count, steps = moved.shape[0], shown.windows.latents.shape[1]
-    what = f"{count} windows of {steps} steps"
-    own = agreement(moved, displacements(shown.start.labels, shown.own.labels, n))
+    of = "" if len(told) == n else f", slots {', '.join(str(slot + 1) for slot in told)}"
+    what = f"{count} windows of {steps} steps{of}"
+    own = agreement(moved, displacements(shown.start.labels, shown.own.labels, n)[:, told])
     lines = [line("replay", own, what if own is not None else STILL)]
     details: dict[str, Any] = {"moving_slots": moving_slots(shown.start.labels, shown.true.labels, n).tolist()}
     if shown.taken is None:
         keys = ("transfer", "transfer_shuffled", "same_slot")
         return [*lines, *(line(key, None, SINGLE_EPISODE) for key in keys)], details
-    elsewhere = displacements(shown.start.labels[shown.windows.others], shown.taken.labels, n)
+    elsewhere = displacements(shown.start.labels[shown.windows.others], shown.taken.labels, n)[:, told]
     alike = agreement(moved, elsewhere)
     wrong, mover = moved[shown.windows.thirds], same_mover(moved, elsewhere)
     chance = same_mover(wrong, elsewhere)
@@ -276,6 +282,7 @@ def _constancy(
     if not used:
         return line("constancy", None, f"mode {model.config.inverse_dynamics.mode} has no prototypes"), None, []
     count, steps, n = len(windows.slots), windows.latents.shape[1], model.slot_shape[0]
+    told = told_slots(model)
     places = np.unique(np.linspace(0, count - 1, min(PLACES, count)).round().astype(int))
     start = windows.slots[places, 0]
     before = draw(model, start)
@@ -283,12 +290,12 @@ def _constancy(
     effects, pictures, table = [], [], []
     for code in used:
         after = draw(model, replay(model, start, model.inverse_dynamics.prototypes[code].expand(shape))[:, -1])
-        effect = displacements(before.labels, after.labels, n)
+        effect = displacements(before.labels, after.labels, n)[:, told]
         effects.append(effect)
         pictures.append(after.frames[[0, -1]])
         mean, slot = effect.mean(0), int(np.linalg.norm(effect.mean(0), axis=-1).argmax())
         spread = float(np.sqrt(((effect[:, slot] - mean[slot]) ** 2).sum(-1).mean()))
-        table.append({"code": code, "slot": slot, "pixels": mean[slot].tolist(), "spread": spread})
+        table.append({"code": code, "slot": told[slot], "pixels": mean[slot].tolist(), "spread": spread})
     share = explained_by_group(np.stack(effects))
     why = f"{len(used)} prototypes in use, each held for {steps} steps from {len(places)} places"
     if share is None:

@@ -103,5 +103,22 @@ def test_a_window_that_moves_alone_has_no_other_to_compare_with() -> None:
         torch.zeros(3, 6, 2, 4), torch.zeros(3, 5, 4), np.zeros((3, 6, 32, 32, 3), np.uint8), elsewhere, elsewhere + 1
     )
     drawn = [Drawn(np.zeros((3, 32, 32, 3), np.uint8), labels) for labels in (start, true, true, true)]
-    lines, _ = transfer_lines(Replayed(windows, *drawn, None), displacements(start, true, 2), 2)
+    lines, _ = transfer_lines(Replayed(windows, *drawn, None), 2, [0, 1])
     assert lines[-1].note == "no other window to compare with moves"
+
+
+def test_slots_that_latents_do_not_see_may_move_by_themselves() -> None:
+    """Slot 1 is replayed as it moved, slot 2 goes its own way."""
+
+    def frames(*places: tuple[int, int]) -> np.ndarray:
+        return np.stack([np.maximum(square(x, 4), 2 * square(other, 20)) for x, other in places])
+
+    start, true, own = frames((2, 10), (2, 10)), frames((6, 2), (18, 20)), frames((6, 20), (18, 2))
+    windows = Windows(
+        torch.zeros(2, 6, 3, 4), torch.zeros(2, 5, 4), np.zeros((2, 6, 32, 32, 3), np.uint8), *[np.array([1, 0])] * 2
+    )
+    drawn = [Drawn(np.zeros((2, 32, 32, 3), np.uint8), labels) for labels in (start, true, own)]
+    found = [transfer_lines(Replayed(windows, *drawn, None, None), 3, told)[0][0] for told in ([0, 1, 2], [0, 1])]
+    assert found[0].verdict == "bad"
+    assert found[1].value == pytest.approx(1.0, abs=0.01)
+    assert [one.note for one in found] == ["2 windows of 5 steps", "2 windows of 5 steps, slots 1, 2"]
