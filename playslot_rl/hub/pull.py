@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -16,7 +17,7 @@ from playslot_rl.datasets.verify import verify
 from playslot_rl.errors import CheckpointError, DataError, HubError, OutputError
 from playslot_rl.hub.layout import LOCAL_RECORD, SCHEME, HubRecord, is_pulled, read_record, require_plain
 from playslot_rl.hub.session import MAIN, Repository, open_repository
-from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, replace_dir, write_json
+from playslot_rl.storage.atomic import explain_write_errors, json_or_nothing, replace_dir, write_bytes, write_json
 from playslot_rl.storage.locks import locked
 
 if TYPE_CHECKING:
@@ -194,16 +195,24 @@ def _finish(partial: Path, root: Path, result: PullResult, endpoint: str) -> Non
 
 
 def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token: str | None = None) -> Path:
-    """Download a policy, unless that commit of it is in the cache, and return the model folder. A CheckpointError where
-    the repository holds none, a HubError for whatever the Hub says.
+    """Download a policy, unless that commit of it is in the cache, and return the model folder. With HF_HUB_OFFLINE=1 a
+    branch or tag is the commit that it was when it was last pulled, which a line says. A CheckpointError where the
+    repository holds none, a HubError for whatever the Hub says.
     """
+    from huggingface_hub import is_offline_mode
+
     from playslot_rl.sharing.folder import CONFIG, FILES, RANGE, WEIGHTS
 
     home = cache_folder(cache) / "policies" / repo_id.replace("/", "--")
     if re.fullmatch("[0-9a-f]{40}", revision) and (home / revision).is_dir():
         return home / revision  # a commit never changes: no network is needed
+    asked = revision or MAIN
+    known = home / "refs" / asked.replace("/", "--")
+    if is_offline_mode() and known.is_file() and (last := home / known.read_text()).is_dir():
+        print(f"note: offline: {asked} of {repo_id} is {last.name[:12]}, as it was last pulled", file=sys.stderr)
+        return last
     with open_repository(repo_id, home, token=token, writing=False, revision=revision, kind="model") as hub:
-        commit = hub.commit_of(revision or MAIN)
+        commit = hub.commit_of(asked)
 
         def fetch(folder: Path) -> None:
             wanted = {path: file for path, file in hub.tree(commit).items() if path in (*FILES, RANGE)}
@@ -213,4 +222,6 @@ def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token:
             hub.download(wanted, commit, folder)
             shutil.rmtree(folder / ".cache", ignore_errors=True)
 
-        return build_once(home / commit, fetch)
+        made = build_once(home / commit, fetch)
+        write_bytes(known, commit.encode())
+        return made

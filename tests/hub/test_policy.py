@@ -84,6 +84,23 @@ def test_the_same_push_again_changes_nothing_and_a_new_policy_replaces_the_old(
     assert old["folder"] == first
 
 
+def test_offline_a_branch_is_the_commit_that_was_last_pulled(
+    hub: FakeHub, client: Client, start: Callable[..., Client], folder: Path, tmp_path: Path
+) -> None:
+    push(client, folder)
+    asked = {"repo_id": "owner/press", "cache": tmp_path / "cache"}
+    offline = start(HF_HUB_OFFLINE="1")
+    assert "HF_HUB_OFFLINE" in offline("pull_policy", **asked)["error"]
+    pulled = client("pull_policy", **asked)["folder"]
+    push(client, write(tmp_path / "other", seed=1))
+    assert offline("pull_policy", **asked)["folder"] == pulled
+    assert offline("pull_policy", **asked, revision="main")["folder"] == pulled
+    assert "HF_HUB_OFFLINE" in offline("pull_policy", **asked, revision="first")["error"]
+    newer = client("pull_policy", **asked)["folder"]
+    assert newer != pulled
+    assert offline("pull_policy", **asked)["folder"] == newer
+
+
 def test_a_card_written_by_hand_and_foreign_files_stay(hub: FakeHub, client: Client, folder: Path) -> None:
     push(client, folder)
     there = hub.repositories[NAME]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -81,6 +82,12 @@ def test_a_commit_that_is_in_the_cache_needs_no_network(folder: Path, tmp_path: 
     for moving in ("", "main", "b" * 40):
         with pytest.raises(ConnectionError):
             pull.pull_policy("me/press", moving, tmp_path / "cache")
+    (there.parent / "refs").mkdir()
+    (there.parent / "refs" / "main").write_text(commit)
+    for offline in (True, False):
+        monkeypatch.setattr("huggingface_hub.is_offline_mode", lambda offline=offline: offline)
+        with nullcontext() if offline else pytest.raises(ConnectionError):  # with a network it may have moved
+            assert pull.pull_policy("me/press", "", tmp_path / "cache") == there
 
 
 def test_saving_twice_gives_equal_files(agent: Agent, config: SharedPolicyConfig, folder: Path, tmp_path: Path) -> None:
