@@ -7,13 +7,16 @@ Exit codes: 0 done, 1 an error of the run, 2 bad arguments, 130 interrupted, 141
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import os
 import select
+import signal
 import sys
 import textwrap
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NoReturn
 
@@ -183,7 +186,8 @@ def _run(name: str, options: argparse.Namespace) -> int:
 def _guarded(name: str, run: Callable[[], int]) -> int:
     """Turn every error into one line and an exit code, or show it whole where `PLAYSLOT_DEBUG=1`."""
     try:
-        return run()
+        with _terminable():
+            return run()
     except KeyboardInterrupt as error:
         goes_on = "; the same command carries on from the last checkpoint or episode"
         where = str(error) or "interrupted" + ("" if name in ANEW else goes_on)
@@ -198,6 +202,32 @@ def _guarded(name: str, run: Callable[[], int]) -> int:
         if _debugging():
             raise
         return _fail(name, explain(error), 1)
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Inside, SIGTERM, by which a cluster ends a job, is as Ctrl-C. Not of several processes, which their launcher ends
+    so while they wait for each other, nor in forked ones, nor where somebody else handles it.
+    """
+    from playslot_rl.runtime.processes import launched
+
+    own, before = os.getpid(), signal.getsignal(signal.SIGTERM)
+    main = threading.current_thread() is threading.main_thread()
+    if launched().world > 1 or before is not signal.SIG_DFL or not main:
+        yield
+        return
+
+    def end(number: int, _: object) -> None:
+        if os.getpid() == own:
+            raise KeyboardInterrupt
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _unread() -> bool:

@@ -128,7 +128,10 @@ def test_a_kill_before_the_first_file_of_a_run_leaves_no_foreign_folder(tmp_path
 
 
 @pytest.mark.slow
-def test_ctrl_c_in_a_terminal_is_one_line_and_carries_on(shared_run: Path, videos: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_in_a_terminal_is_one_line_and_carries_on(
+    by: signal.Signals, shared_run: Path, videos: Path, tmp_path: Path
+) -> None:
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     longer = ("slots.steps=32", "slots.checkpoint_every=4", "slots.validate_every=16", f"data.root={videos}")
     command = ("train-slots", "preset=smoke", f"out={stopped}", *longer)
@@ -137,7 +140,7 @@ def test_ctrl_c_in_a_terminal_is_one_line_and_carries_on(shared_run: Path, video
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
     _wait_for_checkpoint(stopped / "slots" / "checkpoints", lambda: process.poll() is None)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(by)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out) == (130, "")
     assert_one_line(err, "train-slots")
