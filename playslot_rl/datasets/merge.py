@@ -52,11 +52,11 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
     contents = [require_sound(folder) for folder in folders]
     for other in contents[1:]:
         require_same_kind(contents[0], other)
-    say_doubles(contents)
     with new_folder(target, key="--out ") as temporary:
         choices = [choose(each, [span.index for span in each.spans]) for each in contents]
         assemble(choices, temporary, "playslot dataset merge")
         result = require_verified(temporary, folders)
+    say_doubles(contents)
     return MergeResult(target, tuple((c.root, len(c.spans)) for c in contents), result)
 
 
