@@ -130,6 +130,10 @@ class InverseDynamicsConfig(Checked):
         check(alone, key, self.slots, "none with variant=multi, which has a latent action for each slot")
         check(len(set(self.slots)) == len(self.slots), key, self.slots, "each slot once")
 
+    def seen(self, n: int) -> list[int]:
+        """Of n slots, counted from 0, those whose change z tells."""
+        return [number - 1 for number in self.slots] or list(range(n))
+
 
 @dataclass(frozen=True)
 class PredictorConfig(Checked):

@@ -10,6 +10,7 @@ Shapes: F rows (frames), E episodes, A action width, H W image height and width,
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -171,7 +172,7 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
     order, with `weights` of other robots or widths of actions, too; what else is not as in the first is said."""
     first = sources[0]
     known = {(first.fingerprint, first.camera)}
-    for place, source in enumerate(sources[1:], 1):
+    for source in sources[1:]:
         size, expected = ("x".join(map(str, each.image_size)) for each in (source, first))
         facts: list[tuple[str, object, object, str]] = [
             ("frames of", size, expected, ""),
@@ -197,21 +198,18 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
                 "of data.root= or data.camera="
             )
         known.add((source.fingerprint, source.camera))
-        for other in sources[:place]:
-            if other.camera == source.camera:
-                say_shared(source.name, source.origins, other.name, other.origins)
         if source.name != first.name and source.camera != first.camera:
             seen = f"{source.name}: got frames of {source.camera}, expected {first.camera} as in {first.name}"
             say_once(f"note: {seen}: choose by data.camera=, unless they show the same view")
+    for camera in dict.fromkeys(source.camera for source in sources):
+        say_shared([(source.name, source.origins) for source in sources if source.camera == camera])
 
 
-def say_shared(
-    name: str, origins: npt.NDArray[np.str_] | None, other: str, others: npt.NDArray[np.str_] | None
-) -> None:
-    """Say that a data set has episodes of another, told by their `origins`."""
-    if origins is None or others is None or not (count := int(np.isin(origins, others).sum())):
-        return
-    say_once(f"note: {name}: {count} of its {len(origins)} episodes have actions of {other}'s, and count twice")
+def say_shared(sets: Sequence[tuple[str, npt.NDArray[np.str_] | None]]) -> None:
+    """Say which data sets, by their names and their episodes' `origins`, have episodes of an earlier one."""
+    for (other, others), (name, own) in itertools.combinations(sets, 2):
+        if own is not None and others is not None and (count := int(np.isin(own, others).sum())):
+            say_once(f"note: {name}: {count} of its {len(own)} episodes have actions of {other}'s, and count twice")
 
 
 def concatenate(sources: Sequence[EpisodeFrames], weights: bool = False) -> EpisodeFrames:

@@ -56,16 +56,8 @@ def merge(roots: Sequence[str | Path], out: str | Path) -> MergeResult:
         choices = [choose(each, [span.index for span in each.spans]) for each in contents]
         assemble(choices, temporary, "playslot dataset merge")
         result = require_verified(temporary, folders)
-    say_doubles(contents)
+    say_shared([(each.name, episode_origins(each, labels_of(each)["actions"], cache_folder())) for each in contents])
     return MergeResult(target, tuple((c.root, len(c.spans)) for c in contents), result)
-
-
-def say_doubles(contents: Sequence[Contents]) -> None:
-    """Say which data sets have episodes of an earlier one."""
-    origins = [episode_origins(each, labels_of(each)["actions"], cache_folder()) for each in contents]
-    for place, (each, own) in enumerate(zip(contents, origins, strict=True)):
-        for other, others in zip(contents[:place], origins, strict=False):
-            say_shared(each.name, own, other.name, others)
 
 
 def require_same_kind(first: Contents, other: Contents) -> None:

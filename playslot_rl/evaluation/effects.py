@@ -234,17 +234,12 @@ def effect_lines(
     shown = Replayed(windows, start, true, own, taken, swapped)
     if not model.inverse_dynamics.latent_dim:
         return [line(key, None, NO_LATENTS) for key, m in MEASURES.items() if m.group == EFFECTS], {}, shown
-    lines, details = transfer_lines(shown, n, told_slots(model))
+    lines, details = transfer_lines(shown, n, model.config.inverse_dynamics.seen(n))
     constancy, held, table = _constancy(model, windows, used)
     sensitivity, region = _sensitivity(shown, details["moving_slots"])
     details |= {"prototypes": table, "steps": windows.latents.shape[1], "windows": len(first)}
     shown = replace(shown, region=region, held=held, codes=tuple(used))
     return [*lines, constancy, *sensitivity], details, shown
-
-
-def told_slots(model: WorldModel) -> list[int]:
-    """The slots whose change latents tell, from 0: what moves by itself in the others is not theirs to repeat."""
-    return [number - 1 for number in model.config.inverse_dynamics.slots] or list(range(model.slot_shape[0]))
 
 
 def transfer_lines(shown: Replayed, n: int, told: list[int]) -> tuple[list[Line], dict[str, Any]]:
@@ -282,7 +277,7 @@ def _constancy(
     if not used:
         return line("constancy", None, f"mode {model.config.inverse_dynamics.mode} has no prototypes"), None, []
     count, steps, n = len(windows.slots), windows.latents.shape[1], model.slot_shape[0]
-    told = told_slots(model)
+    told = model.config.inverse_dynamics.seen(n)  # what moves by itself in other slots is not theirs to repeat
     places = np.unique(np.linspace(0, count - 1, min(PLACES, count)).round().astype(int))
     start = windows.slots[places, 0]
     before = draw(model, start)

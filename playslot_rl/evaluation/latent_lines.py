@@ -205,8 +205,7 @@ def telling_slots(parsed: ParsedEpisodes) -> list[dict[str, Any]]:
 
 def _telling_line(model: InverseDynamics, slots: Sequence[Mapping[str, Any]]) -> Line:
     """Of the change that the latents see, how much is in slots that tell of the action; which slots to choose."""
-    chosen = model.config.slots
-    seen = [one for one in slots if not chosen or one["slot"] in chosen]
+    seen = [slots[n] for n in model.config.seen(len(slots))]
     telling = [one for one in seen if one["r2"] > NOTHING]
     told = ", ".join(f"{one['slot']} ({one['r2']:.2f})" for one in telling) or "none"
     share = sum(one["change"] for one in telling) / max(sum(one["change"] for one in seen), 1e-12)

@@ -111,7 +111,7 @@ class InverseDynamics(nn.Module):
     def scene_dynamics(self, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the scene dynamics of each frame: slots (..., N, D) -> two of (..., [N,] Z)."""
         if self.config.slots:
-            slots = slots[..., [number - 1 for number in self.config.slots], :]
+            slots = slots[..., self.config.seen(slots.shape[-2]), :]
         h = self.encoder(slots)
         with full_precision(slots.device.type):  # z is a difference of two means that are nearly equal
             h = h.to(slots.dtype)
