@@ -60,16 +60,18 @@ def first_difference(
 ) -> tuple[str, Any, Any] | None:
     """The first dotted key at which two nested configs differ: (key as it is typed, stored value, wanted value).
 
-    A wanted precision of `auto` is equal to any that was stored, a key of the machine to any, and so is the place of
-    what a training started from where both say what that was (`started_from`). A key that came after what is stored
-    counts as what was computed without it (`playslot_rl.config.roles.was`). `typed` makes of a key as it is stored the
-    full name under which it is typed.
+    A wanted precision of `auto` is equal to any that was stored, a key of the machine to any, so is the place of what
+    a training started from where both say what that was (`started_from`), and so is the camera of what does not say
+    its own. A key that came after what is stored counts as what was computed without it
+    (`playslot_rl.config.roles.was`). `typed` makes of a key as it is stored the full name under which it is typed.
     """
     right, known = flatten(wanted), earlier(ExperimentConfig)
     left = {**{key: known[typed(key)] for key in right if typed(key) in known}, **flatten(stored)}
     places = keys_of(ExperimentConfig, "machine")
     if "started_from" in left.keys() & right.keys():
         places |= {"slots.start_from"}
+    if "data.camera" not in left:  # checkpoints of before did not say it
+        places |= {"data.camera"}
     for key in sorted(left.keys() | right.keys()):
         if typed(key) in places:
             continue

@@ -282,7 +282,9 @@ class StageRecord:
         picked: dict[str, Any] = {}
         for key in (*self.spec.keys, *self.spec.begun):
             put(picked, self.spec.stored_name(key, begun=True), self._value(key))
-        data: dict[str, Any] = {"data": self.data.fingerprint} if self.role else {}
+        data: dict[str, Any] = {}
+        if self.role:
+            data = {"data": self.data.fingerprint, "data.camera": self.data.camera}
         if self.role == "demos" and scaled(self.actions):
             data["actions"] = said(self.actions)
         if self.labelled is not None:

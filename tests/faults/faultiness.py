@@ -6,6 +6,8 @@ work folder: a file or folder is made (or opened to be written), renamed, or rem
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import resource
@@ -97,11 +99,17 @@ def _path(event: str, arguments: tuple[Any, ...]) -> str:
 
 
 def _jobs_here() -> None:
-    """A comparison's jobs run in the process of its command, are killed with it, and need no imports of their own."""
+    """A comparison's jobs run in the process of its command, are killed with it, and need no imports of their own.
+    What they say goes to a log otherwise: it is none of the command's lines.
+    """
     from playslot_rl.recipes import compare_job
     from playslot_rl.studies import launch
 
-    launch.run_process = compare_job.main
+    def run(file: Path) -> launch.Status:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            return compare_job.main(file)
+
+    launch.run_process = run
 
 
 def _give_up_capabilities() -> None:

@@ -14,6 +14,7 @@ from playslot_rl.config import DataConfig, ExperimentConfig
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import CheckpointError
 from playslot_rl.methods.playslot.method import SLOTS
+from playslot_rl.storage.resume import first_difference
 from playslot_rl.training import record as records
 from playslot_rl.training.record import StageRecord
 
@@ -71,3 +72,19 @@ def test_a_stage_is_finished_with_the_camera_that_it_was_shown(
     else:
         with pytest.raises(CheckpointError, match=f"data.camera: got {camera}, expected front"):
             record.finished()
+
+
+@pytest.mark.parametrize(
+    ("camera", "stored", "resumed"),
+    [("front", "front", True), ("front", None, True), ("side", "front", False), ("front,side", "front", False)],
+)
+def test_a_stage_that_was_begun_goes_on_with_its_camera_alone(
+    camera: str, stored: str | None, resumed: bool, tmp_path: Path
+) -> None:
+    record = StageRecord(SLOTS, tmp_path, ExperimentConfig(data=DataConfig(root="videos")))
+    vars(record)["videos"] = replace(moving_square(), camera=camera)
+    begun = {key: value for key, value in record.resumes().items() if key != "data.camera"}
+    if stored is not None:  # versions before did not say it
+        begun["data.camera"] = stored
+    found = first_difference(begun, record.resumes(), record.spec.typed)
+    assert found == (None if resumed else ("data.camera", stored, camera))
