@@ -18,6 +18,9 @@ import numpy as np
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.weights import data_roots
+from playslot_rl.data.agreement import open_files
+from playslot_rl.data.cache import cache_folder
+from playslot_rl.data.prints import files_fingerprint
 from playslot_rl.datasets.adoption import (
     SHARES,
     Budget,
@@ -60,7 +63,8 @@ def main(config: ExperimentConfig) -> None:
             "half of them: record longer episodes"
         )
     asked = {"minutes": config.minutes, "seed": config.seed, "preset": config.preset, **to_dict(config.adopt)}
-    decide = Decisions(run, {"data.root": config.data.root, "camera": seen.camera, **asked}, began)
+    content = files_fingerprint(open_files(config.data.root), seen.camera, cache_folder(config.data.cache))
+    decide = Decisions(run, {"data": content, "camera": seen.camera, **asked}, began)
     config = replace(for_frames(config, seen, decide), out=str(run), run="")
     kept = -(-seen.lengths // config.data.stride)
     budget = Budget(decide, 60 * config.minutes, int(kept.sum()), len(kept), seen.action_dim > 0)

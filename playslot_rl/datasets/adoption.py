@@ -49,7 +49,7 @@ class Decisions:
         stored: dict[str, Any] = json.loads(self.path.read_text()) if self.path.is_file() else {}
         facts = json.loads(json.dumps(facts))
         for key, value in stored.get("facts", facts).items():
-            if facts.get(key) != value:
+            if facts.get(key, value) != value:  # versions before kept where the data set lies, not what it is
                 raise ConfigError(
                     f"{key}: got {facts.get(key)}, expected {value}, with which out={run} was begun: leave it, or use "
                     "another out="

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from playslot_rl.data.windows import split_episodes
 from playslot_rl.datasets import adoption
 from playslot_rl.datasets.adoption import SHORTEST, clip_room, savi_for, scheduled, start_for, steps_within, too_short
 from playslot_rl.datasets.survey import Survey
+from playslot_rl.errors import ConfigError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.recipes.play import open_studio
 from playslot_rl.runs import Run
@@ -77,12 +79,22 @@ def test_a_set_that_nobody_prepared_becomes_a_world_model(
     assert model.world_model.slot_shape[0] == made["slots"]["value"]
     assert json.loads((run / "config.json").read_text())["data"]["stride"] == made["stride"]["value"]
 
-    again = smoke("adopt", f"data.root={any_set}", f"out={run}", *QUICK)
+    moved = shutil.copytree(any_set, tmp_path / "moved")
+    again = smoke("adopt", f"data.root={moved}", f"out={run}", *QUICK)
     assert json.loads((run / "adopt.json").read_text())["choices"] == made
     assert again.out.count("finished before") == 2
     assert again.out.splitlines()[-1] == done.out.splitlines()[-1]
     longer = ("minutes=3", *QUICK[1:])
     refused("adopt", f"data.root={any_set}", f"out={run}", *longer, message="minutes: got 3.0, expected 0.02")
+    other = write_set(tmp_path / "other", (24, 30, 26, 24, 28), speed=1)
+    refused("adopt", f"data.root={other}", f"out={run}", *QUICK, message=r"data: got \w+, expected \w+, with which")
+
+
+def test_an_adoption_of_before_goes_on_wherever_its_set_lies(tmp_path: Path) -> None:
+    (tmp_path / "adopt.json").write_text(json.dumps({"facts": {"data.root": "set", "seed": 0}, "choices": {}}))
+    assert adoption.Decisions(tmp_path, {"data": "0216", "seed": 0}, 0.0).facts["data"] == "0216"
+    with pytest.raises(ConfigError, match="seed: got 1, expected 0"):
+        adoption.Decisions(tmp_path, {"data": "0216", "seed": 1}, 0.0)
 
 
 def test_the_settings_say_what_is_done_with_the_actions_between_two_kept_frames(
