@@ -116,7 +116,9 @@ def test_the_table_over_tasks_has_every_rate_and_the_mean_of_the_middle_half(res
     }, "the oracle is not finished in both"
     for row in joint["rows"]:
         assert row["ci95"][0] < row["score"] < row["ci95"][1]
-    assert joint["ahead"] == [{"labels": 5, "ahead": ["easy"], "behind": ["hard"]}], "equal is not ahead"
+    assert joint["ahead"] == [{"labels": 5, "ahead": ["easy"], "surely": ["easy"], "behind": ["hard"]}], (
+        "equal is not ahead"
+    )
 
 
 def test_the_page_of_tasks_shows_them(results: list[dict[str, Any]], tmp_path: Path) -> None:
@@ -125,8 +127,14 @@ def test_the_page_of_tasks_shows_them(results: list[dict[str, Any]], tmp_path: P
     assert "| success, % | PlaySlot | Slot BC |" in table
     assert "| easy | 90 (" in table
     assert "| interquartile mean | 60 (" in table
-    assert "PlaySlot is ahead of all methods on the labels alone in 1 of 2 tasks; not in hard." in table
+    said = "PlaySlot is ahead of all methods on the labels alone in 1 of 2 tasks, by intervals that leave out 0 in 1;"
+    assert f"{said} not in hard." in table
     assert "| hard | – |" in page.partition("## Over tasks\n")[2], "the oracle was not measured there"
+
+
+def test_ahead_by_an_episode_is_not_surely_ahead(tmp_path: Path) -> None:
+    close = joint_table([ended(tmp_path, "easy", (5, 4), (5, 3))], "playslot")
+    assert close["ahead"] == [{"labels": 5, "ahead": ["easy"], "surely": [], "behind": []}]
 
 
 def lacking(result: dict[str, Any], *names: str) -> dict[str, Any]:
@@ -142,7 +150,7 @@ def test_a_cell_that_lacks_a_run_is_shown_and_in_no_mean(results: list[dict[str,
     broken = [results[0], lacking(results[1], "slot_bc-d5-l5-s1")]
     joint = joint_table(broken, "playslot")
     assert [row["method"] for row in joint["rows"]] == ["playslot"]
-    assert joint["ahead"] == [{"labels": 5, "ahead": ["easy"], "behind": []}]
+    assert joint["ahead"] == [{"labels": 5, "ahead": ["easy"], "surely": ["easy"], "behind": []}]
     assert [row["env"] for row in joint["summary"] if row["method"] == "slot_bc"] == ["easy", "hard"]
     page = to_markdown(success_page({**results[0], "across_tasks": joint}))
     table = page.partition("## Over tasks, with 5 labelled demonstrations")[2].partition("## ")[0]
@@ -150,7 +158,7 @@ def test_a_cell_that_lacks_a_run_is_shown_and_in_no_mean(results: list[dict[str,
     assert line.split("|")[3].strip().startswith("30 (")
     assert line.split("|")[3].strip().endswith("; 1 of 2 seeds)")
     assert re.search(r"\| interquartile mean \| 60 \(\d+ to \d+\) \| – \|", table)
-    assert "in 1 of 1 tasks that have all runs." in table
+    assert "in 1 of 1 tasks that have all runs," in table
     nothing = joint_table([results[0], lacking(results[1], "slot_bc-d5-l5-s0", "slot_bc-d5-l5-s1")], "playslot")
     page = to_markdown(success_page({**results[0], "across_tasks": nothing}))
     assert re.search(r"\| hard \| 30 \(.*\) \| – \(0 of 2 seeds\) \|", page)

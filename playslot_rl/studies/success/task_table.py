@@ -17,8 +17,9 @@ IQM = "interquartile mean"
 def joint_table(results: Sequence[Result], reference: str | None) -> dict[str, Any]:
     """`tasks`; `summary`, every task's with its `env`; `cells`, of these the ones of the largest number of
     demonstrations, with `runs` that are done, `of` all; `rows`, the interquartile means over tasks; and `ahead`, of
-    each number of labels the tasks in which the reference in simulation beats every method on these labels alone, and
-    the others, of those that have all runs.
+    each number of labels the tasks in which the reference in simulation beats every method on these labels alone,
+    those in which it does by intervals of the paired differences (`surely`), and those in which it does not, of tasks
+    that have all runs.
     """
     cells = [cell for result in results for cell in _cells(result)]
     return {
@@ -27,7 +28,7 @@ def joint_table(results: Sequence[Result], reference: str | None) -> dict[str, A
         "summary": [{"env": result["env"], **row} for result in results for row in result["summary"]],
         "cells": cells,
         "reference": reference,
-        "ahead": _ahead(cells, reference),
+        "ahead": _ahead(results, cells, reference),
     }
 
 
@@ -46,19 +47,28 @@ def _cells(result: Result) -> list[dict[str, Any]]:
     return found
 
 
-def _ahead(cells: Sequence[Result], reference: str | None) -> list[dict[str, Any]]:
+def _ahead(results: Sequence[Result], cells: Sequence[Result], reference: str | None) -> list[dict[str, Any]]:
     found = []
     for labels in sorted({cell["labels"] for cell in cells} - {None}):
-        sides: dict[str, Any] = {"labels": labels, "ahead": [], "behind": []}
-        for task in dict.fromkeys(cell["env"] for cell in cells):
+        sides: dict[str, Any] = {"labels": labels, "ahead": [], "surely": [], "behind": []}
+        for result in results:
+            task = result["env"]
             own = [cell for cell in cells if (cell["env"], cell["labels"]) == (task, labels)]
             first = [cell for cell in own if (cell["method"], cell["protocol"]) == (reference, "simulation")]
             alone = [cell for cell in own if METHODS[cell["method"]].labelled_only]
             if first and alone and all(map(_whole, [*first, *alone])):
                 rate, *others = (round(cell["success_rate"], 9) for cell in [*first, *alone])  # means round differently
                 sides["ahead" if rate > max(others) else "behind"].append(task)
+                if {cell["method"] for cell in alone} <= _worse(result, first[0]):
+                    sides["surely"].append(task)
         found += [sides] if sides["ahead"] or sides["behind"] else []
     return found
+
+
+def _worse(result: Result, reference: Result) -> set[str]:
+    """Methods that are behind the reference's cell by an interval that leaves out 0."""
+    rows = [row for row in result["differences"] if row["protocol"] == "simulation" and row["better"] is False]
+    return {row["method"] for row in rows if all(row[name] == reference[name] for name in ("demos", "labels"))}
 
 
 def _whole(cell: Result) -> bool:
@@ -93,10 +103,9 @@ def _blocks(joint: Result, labels: int | None) -> list[Block]:
     for sides in (sides for sides in joint["ahead"] if sides["labels"] == labels):
         where = f"; not in {', '.join(sides['behind'])}" if sides["behind"] else ""
         of = f"{len(sides['ahead']) + len(sides['behind'])} tasks{' that have all runs' if missing else ''}"
-        said = (
-            f"{METHODS[joint['reference']].title} is ahead of all methods on the labels alone in {len(sides['ahead'])}"
-        )
-        blocks.append(Text(f"{said} of {of}{where}."))
+        title, ahead = METHODS[joint["reference"]].title, len(sides["ahead"])
+        said = f"{title} is ahead of all methods on the labels alone in {ahead} of {of}"
+        blocks.append(Text(f"{said}, by intervals that leave out 0 in {len(sides['surely'])}{where}."))
     return blocks
 
 
