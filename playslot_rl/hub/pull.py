@@ -223,5 +223,6 @@ def pull_policy(repo_id: str, revision: str = "", cache: str | Path = "", token:
             shutil.rmtree(folder / ".cache", ignore_errors=True)
 
         made = build_once(home / commit, fetch)
-        write_bytes(known, commit.encode())
+        if asked != commit:
+            write_bytes(known, commit.encode())
         return made
