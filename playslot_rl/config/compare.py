@@ -43,7 +43,7 @@ class CompareConfig(Checked):
         demos: numbers of demonstrations, for the methods that learn from them.
         labels: numbers of labelled demonstrations. Those with latent actions learn from the videos of all `demos`
             and the real actions of so many of them, oracles from the actions of all, the other rows that clone (BC,
-            ACT, Diffusion Policy) from the labelled ones alone. Empty: they see those of `behaviour.labelled_demos`.
+            ACT, Diffusion Policy) from the labelled ones alone. Empty: those of `behaviour.labelled_demos`.
         videos: numbers of unlabelled videos that policies clone beside `labels`, instead of `demos`.
         worlds: world models, and models such as LAPO's, each with all seeds: `run`, `runs`, the rest trained.
         runs: run folders of further world models, separated by commas.

@@ -10,6 +10,7 @@ from playslot_rl.config.roles import (
     COUNT,
     NOT_NEGATIVE,
     RATE,
+    UNSAID,
     Checked,
     above_zero,
     at_least,
@@ -102,12 +103,13 @@ class SlotsStageConfig(StageConfig):
 
     Attributes:
         clip_frames: frames per clip.
-        start_from: run (or `pretrained/ENV`) whose SAVi this one starts from; empty starts from scratch (paper).
-        motion_weight: so many times more than others counts a pixel that moves; 0 counts all alike (paper).
-        zoom_steps: in so many first steps single frames, magnified, are shown (`playslot_rl.data.zoom`); 0 has none.
+        start_from: run (or `pretrained/ENV`) whose SAVi it starts from; empty is scratch (paper).
+        motion_weight: so many times more counts a pixel that moves; 0 (paper) not.
+        foreground_weight: so many times more counts a pixel that is not the median of the batch; 0 (paper) not.
+        zoom_steps: so many first steps show single frames, magnified (`playslot_rl.data.zoom`); 0 has none.
         zoom: how many times.
-        patience: end before `steps` once the error on held-out clips has not fallen for so many validations, with the
-            weights that had the lowest; 0 trains all steps.
+        patience: end once the held-out error has not fallen for so many validations, with the weights of the lowest; 0
+            trains all steps.
         segmented_episodes: so many episodes of the task are drawn by its simulator, and every validation scores the
             slots against their segmentation (FG-ARI); 0 does not.
     """
@@ -116,6 +118,9 @@ class SlotsStageConfig(StageConfig):
     clip_frames: int = field(default=8, metadata=COUNT)
     start_from: str = field(default="", metadata=role("folder"))
     motion_weight: float = field(default=0.0, metadata=was(0.0) | at_least(0, "0 (all pixels alike) or more"))
+    foreground_weight: float = field(
+        default=0.0, metadata=was(0.0) | UNSAID | at_least(0, "0 (all pixels alike) or more")
+    )
     zoom_steps: int = field(default=0, metadata=was(0) | at_least(0, "0 (none) or more"))
     zoom: float = field(default=2.0, metadata=was(2.0) | between(1, 8, "1 (as they are) to 8 times"))
     patience: int = field(default=0, metadata=was(0) | at_least(0, "0 (train all steps) or more"))

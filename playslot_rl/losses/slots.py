@@ -2,14 +2,15 @@
 
     L = mean (o_t - o^_t)^2,   frames in [0, 1]
 
-With a motion weight lambda, pixels that move count 1 + lambda times, in each clip b by itself:
+With a motion weight lambda and a foreground weight mu, what is of interest counts more, in each clip b by itself:
 
-    L = mean_b  sum_{t,p} w_{b,t,p} (o - o^)^2 / sum_{t,p} w_{b,t,p},   w = 1 + lambda m
+    L = mean_b  sum_{t,p} w_{b,t,p} (o - o^)^2 / sum_{t,p} w_{b,t,p},   w = 1 + lambda m + mu f
 
-where m_{b,t,p} is 1 where the pixel changes from the frame before or to the one after, else 0.
+where m_{b,t,p} is 1 where the pixel changes from the frame before or to the one after, and f_{b,t,p} where it is not
+the median of all frames of the batch at p (background subtraction), else 0: a goal that lies still moves in no clip.
 
-Note: the paper has lambda = 0. Where small things move over a ground that stays, they are a few hundredths of the plain
-error, and SAVi learns the ground alone for a long time.
+Note: the paper has lambda = mu = 0. Small things over a ground that stays are a few hundredths of the plain error, and
+SAVi learns the ground alone for a long time.
 
 Shapes: B batch, T frames, H W image height and width.
 """
@@ -40,6 +41,7 @@ class SlotsLoss(LossModule):
     Args:
         savi: the model that is trained.
         motion_weight: lambda.
+        foreground_weight: mu.
 
     Examples:
         >>> from playslot_rl.testing import tiny_agent
@@ -61,9 +63,9 @@ class SlotsLoss(LossModule):
     default_keys = _AcceptedKeys
     out_keys = ("loss_reconstruction", "psnr")
 
-    def __init__(self, savi: SAVi, motion_weight: float = 0.0) -> None:
+    def __init__(self, savi: SAVi, motion_weight: float = 0.0, foreground_weight: float = 0.0) -> None:
         super().__init__()
-        self.savi, self.motion_weight = savi, motion_weight
+        self.savi, self.motion_weight, self.foreground_weight = savi, motion_weight, foreground_weight
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -75,8 +77,8 @@ class SlotsLoss(LossModule):
         error = (decoded.frames - frames).square()
         mse = error.mean()
         loss = mse
-        if self.motion_weight:
-            weight = 1.0 + self.motion_weight * moving(frames)
+        if self.motion_weight or self.foreground_weight:
+            weight = 1.0 + self.motion_weight * moving(frames) + self.foreground_weight * foreground(frames)
             loss = ((weight * error.mean(2)).sum((1, 2, 3)) / weight.sum((1, 2, 3))).mean()
         return TensorDict({"loss_reconstruction": loss, "psnr": batch_psnr(mse)}, [])
 
@@ -96,3 +98,9 @@ def moving(frames: Tensor) -> Tensor:
     either[:, 1:] = changed
     either[:, :-1] = torch.maximum(either[:, :-1], changed)
     return either
+
+
+def foreground(frames: Tensor) -> Tensor:
+    """1 where a pixel is not what it mostly is in these clips, else 0: (B, T, H, W) of (B, T, 3, H, W)."""
+    background = frames.flatten(0, 1).median(0).values
+    return moves(frames - background).squeeze(2).to(frames.dtype)

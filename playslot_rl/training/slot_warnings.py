@@ -22,8 +22,8 @@ UNSEEN: Final = 0.3
 
 MAGNIFIED: Final = 1500
 """First steps with magnified frames that took slots off the plateau, of a stage that is three times as long or more."""
-MOTION: Final = 30
-"""Weight of the pixels that move, with which a ball of 40 pixels was drawn."""
+FOREGROUND: Final = 30
+"""Weight with which goals and cubes of 20 to 40 pixels were drawn."""
 
 
 def slot_warnings(values: Mapping[str, float], savi: SAViConfig, stage: SlotsStageConfig) -> dict[str, str]:
@@ -56,7 +56,8 @@ def slot_warnings(values: Mapping[str, float], savi: SAViConfig, stage: SlotsSta
         cure = _LONGER.format(stage.steps) if savi.transition_start == "identity" else _IDENTITY
         found["flicker"] = f"slots change places ({values['flicker']:.2f} exchanges a transition): {cure}"
     if values.get("moving_explained", 1.0) < UNSEEN:
-        weight = "" if stage.motion_weight else f"weigh what moves (slots.motion_weight={MOTION}), "
+        weighed = stage.motion_weight or stage.foreground_weight
+        weight = "" if weighed else f"weigh what is not background (slots.foreground_weight={FOREGROUND}), "
         found["unseen"] = (
             f"what moves is hardly drawn ({100 * values['moving_explained']:.0f} % of the moving pixels' change "
             f"explained): {weight}{_leave_plateau(savi, stage)}"

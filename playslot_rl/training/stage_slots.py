@@ -44,7 +44,7 @@ class SlotsStage:
     ) -> None:
         self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
         self.segmented = segmented
-        self.criterion = SlotsLoss(savi, config.motion_weight)
+        self.criterion = SlotsLoss(savi, config.motion_weight, config.foreground_weight)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:

@@ -154,10 +154,13 @@ def test_a_cure_in_use_is_not_named_again() -> None:
     assert "identity" not in found["flicker"]
     assert "decoder_position" not in found["unseen"]
     assert "slots.zoom_steps=1500" in found["unseen"]
-    assert "slots.motion_weight=30" in found["unseen"]
-    used = replace(LONG, zoom_steps=1500, start_from="pretrained/block_push_easy", motion_weight=30.0)
-    left = slot_warnings(HEALTHY | {"moving_explained": 0.0}, SAViConfig(decoder="pixel_shuffle"), used)["unseen"]
-    assert left.endswith("explained): train for longer than 6000 steps (slots.steps=, or minutes= of adopt)")
+    assert "slots.foreground_weight=30" in found["unseen"]
+    used = replace(LONG, zoom_steps=1500, start_from="pretrained/block_push_easy")
+    for weighed in (replace(used, motion_weight=30.0), replace(used, foreground_weight=30.0)):
+        left = slot_warnings(HEALTHY | {"moving_explained": 0.0}, SAViConfig(decoder="pixel_shuffle"), weighed)
+        assert left["unseen"].endswith(
+            "explained): train for longer than 6000 steps (slots.steps=, or minutes= of adopt)"
+        )
 
 
 @pytest.mark.parametrize(

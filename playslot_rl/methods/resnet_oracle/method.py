@@ -22,7 +22,7 @@ class ResNetOracleConfig(StageConfig):
     """Schedule of the ResNet oracle; the head's sizes are `model.policy`, its loss `behaviour.loss`.
 
     Attributes:
-        weights: of ResNet-18: `auto` (ImageNet's from torchvision's cache, from scratch where they are not there),
+        weights: of ResNet-18: `auto` (ImageNet's in torchvision's cache, else from scratch),
             `scratch`, `download` (ImageNet's, fetched if they are not in the cache), or the path of a file of them
             (`.pth` as torchvision publishes it, or `.safetensors` with the same names).
         shift: frames are shifted by up to so many pixels either way in training, edges repeated; 0 does not.
