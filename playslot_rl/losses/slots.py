@@ -7,7 +7,7 @@ With a motion weight lambda and a foreground weight mu, what is of interest coun
     L = mean_b  sum_{t,p} w_{b,t,p} (o - o^)^2 / sum_{t,p} w_{b,t,p},   w = 1 + lambda m + mu f
 
 where m_{b,t,p} is 1 where the pixel changes from the frame before or to the one after, and f_{b,t,p} where it is not
-the median of all frames of the batch at p (background subtraction), else 0: a goal that lies still moves in no clip.
+that of the background b_p, the median of frames of the videos, else 0: a goal that lies still moves in no clip.
 
 Note: the paper has lambda = mu = 0. Small things over a ground that stays are a few hundredths of the plain error, and
 SAVi learns the ground alone for a long time.
@@ -42,6 +42,7 @@ class SlotsLoss(LossModule):
         savi: the model that is trained.
         motion_weight: lambda.
         foreground_weight: mu.
+        background: frame (3, H, W) in [0, 1], from `background`; needed where mu is not 0.
 
     Examples:
         >>> from playslot_rl.testing import tiny_agent
@@ -63,9 +64,16 @@ class SlotsLoss(LossModule):
     default_keys = _AcceptedKeys
     out_keys = ("loss_reconstruction", "psnr")
 
-    def __init__(self, savi: SAVi, motion_weight: float = 0.0, foreground_weight: float = 0.0) -> None:
+    def __init__(
+        self,
+        savi: SAVi,
+        motion_weight: float = 0.0,
+        foreground_weight: float = 0.0,
+        background: Tensor | None = None,
+    ) -> None:
         super().__init__()
         self.savi, self.motion_weight, self.foreground_weight = savi, motion_weight, foreground_weight
+        self.background = background
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -78,7 +86,10 @@ class SlotsLoss(LossModule):
         mse = error.mean()
         loss = mse
         if self.motion_weight or self.foreground_weight:
-            weight = 1.0 + self.motion_weight * moving(frames) + self.foreground_weight * foreground(frames)
+            weight = 1.0 + self.motion_weight * moving(frames)
+            if self.foreground_weight:
+                assert self.background is not None
+                weight = weight + self.foreground_weight * foreground(frames, self.background)
             loss = ((weight * error.mean(2)).sum((1, 2, 3)) / weight.sum((1, 2, 3))).mean()
         return TensorDict({"loss_reconstruction": loss, "psnr": batch_psnr(mse)}, [])
 
@@ -100,7 +111,11 @@ def moving(frames: Tensor) -> Tensor:
     return either
 
 
-def foreground(frames: Tensor) -> Tensor:
-    """1 where a pixel is not what it mostly is in these clips, else 0: (B, T, H, W) of (B, T, 3, H, W)."""
-    background = frames.flatten(0, 1).median(0).values
+def background(frames: Tensor) -> Tensor:
+    """What each pixel mostly is, the median of frames (..., 3, H, W): float32 (3, H, W) in [0, 1]."""
+    return normalise(frames.flatten(0, -4)).median(0).values
+
+
+def foreground(frames: Tensor, background: Tensor) -> Tensor:
+    """1 where a pixel is not the background's (3, H, W), else 0: (B, T, H, W) of (B, T, 3, H, W)."""
     return moves(frames - background).squeeze(2).to(frames.dtype)

@@ -18,7 +18,7 @@ from playslot_rl.data.views import IntArray
 from playslot_rl.data.zoom import corners, magnified
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import psnr, to_uint8
-from playslot_rl.losses.slots import SlotsLoss
+from playslot_rl.losses.slots import SlotsLoss, background
 from playslot_rl.modules.savi import Decoded, SAVi
 from playslot_rl.modules.savi.health import SlotHealth
 from playslot_rl.runtime.processes import spread
@@ -44,7 +44,13 @@ class SlotsStage:
     ) -> None:
         self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
         self.segmented = segmented
-        self.criterion = SlotsLoss(savi, config.motion_weight, config.foreground_weight)
+        usual = (
+            background(clips.pixels(clips.spread(clips.train_episodes), self.device))
+            if config.foreground_weight
+            else None
+        )
+        self.criterion = SlotsLoss(savi, config.motion_weight, config.foreground_weight, usual)
+        self.magnified = SlotsLoss(savi, config.motion_weight)  # magnified frames have another background
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -68,9 +74,10 @@ class SlotsStage:
         at = own_rows(corners(count, self.savi.image_size, own.zoom, generators.numpy("zoom")))
         return {keys.PIXELS: magnified(frames, own.zoom, at)}
 
-    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
+    def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:
         self.savi.precision = self.config.precision
-        out = self.criterion(TensorDict(dict(batch)), generator=generators.torch("slots"))
+        criterion = self.magnified if step < self.config.zoom_steps else self.criterion
+        out = criterion(TensorDict(dict(batch)), generator=generators.torch("slots"))
         return {"loss": out["loss_reconstruction"], "psnr": out["psnr"]}
 
     def validate(self, step: int) -> Mapping[str, float]:

@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.losses import SlotsLoss, total_loss
-from playslot_rl.losses.slots import foreground, moving
+from playslot_rl.losses.slots import background, foreground, moving
 from playslot_rl.testing import tiny_agent
 
 
@@ -70,11 +70,13 @@ def test_a_pixel_that_moves_counts_more_in_its_own_clip() -> None:
     assert torch.equal(weighted["psnr"], plain["psnr"])
 
 
-def test_what_lies_still_in_a_clip_counts_more_where_other_clips_have_the_ground() -> None:
+def test_what_lies_still_counts_more_where_it_is_not_the_background() -> None:
     savi, frames = tiny_agent().world_model.savi, torch.full((3, 2, 3, 64, 64), 0.5)
     frames[:, :, :, 20:40, 20:40] = 0.9  # in every clip: the ground
     frames[0, :, 0, 4:8, 10] = 0.9  # a goal
-    found = foreground(frames)
+    usual = background(frames)
+    assert torch.equal(usual, frames[1, 0])
+    found = foreground(frames, usual)
     assert (found[0, :, 4:8, 10] == 1).all()
     assert (found.sum((2, 3)) == torch.tensor([[4.0, 4.0], [0.0, 0.0], [0.0, 0.0]])).all()
     assert moving(frames).sum() == 0
@@ -82,7 +84,8 @@ def test_what_lies_still_in_a_clip_counts_more_where_other_clips_have_the_ground
     error = (savi.decode(savi(frames)[0]).frames - frames).square().mean(2)
     of_goal, rest = error[0][found[0] > 0].sum(), error[0][found[0] == 0].sum()
     first = (10 * of_goal + rest) / (10 * 8 + error[0].numel() - 8)
-    weighted = SlotsLoss(savi, foreground_weight=9.0)(TensorDict({keys.PIXELS: frames}, [3]))
+    loss = SlotsLoss(savi, foreground_weight=9.0, background=usual)
+    weighted = loss(TensorDict({keys.PIXELS: frames}, [3]))
     torch.testing.assert_close(weighted["loss_reconstruction"], (first + error[1].mean() + error[2].mean()) / 3)
 
 
