@@ -21,7 +21,8 @@ def shown(step: int, seed: int = 0) -> Tensor:
     """The batch that one step of a training reads, which magnifies in its first two."""
     stage = SlotsStage(tiny_savi(), clips(32, 4), SlotsStageConfig(**SETTINGS, clip_frames=4, zoom_steps=ZOOMED))
     seen: list[TensorDict] = []
-    stage.criterion.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    for loss in (stage.criterion, stage.magnified):
+        loss.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     step_loss(stage, step, StepGenerators(seed, step))
     batch: Tensor = seen[0][keys.PIXELS]
     return batch
@@ -44,3 +45,13 @@ def test_what_is_magnified_hangs_on_seed_and_step_alone() -> None:
     assert torch.equal(shown(1), shown(1))
     assert not torch.equal(shown(1), shown(0))
     assert not torch.equal(shown(1), shown(1, seed=1))
+
+
+def test_the_background_is_that_of_the_training_videos_and_of_no_magnified_frames() -> None:
+    shown = clips(32, 4)
+    stage = SlotsStage(tiny_savi(), shown, SlotsStageConfig(**SETTINGS, clip_frames=4, foreground_weight=9.0))
+    frames = torch.from_numpy(videos(32).frames[shown.spread(shown.train_episodes)].reshape(-1, 32, 32, 3))
+    assert stage.criterion.background is not None
+    assert torch.equal(stage.criterion.background, frames.movedim(-1, -3).float().div(255).median(0).values)
+    assert (stage.criterion.foreground_weight, stage.magnified.foreground_weight) == (9.0, 0.0)
+    assert SlotsStage(tiny_savi(), shown, SlotsStageConfig(**SETTINGS, clip_frames=4)).criterion.background is None

@@ -109,7 +109,7 @@ def demonstrations() -> Demonstrations:
 
 def slots() -> Part:
     savi = tiny_savi(initial="gaussian").to(DEVICE)
-    own = SlotsStageConfig(**SETTINGS, clip_frames=4, zoom_steps=8)
+    own = SlotsStageConfig(**SETTINGS, clip_frames=4, zoom_steps=8, foreground_weight=3.0)
     return Part("slots", SlotsStage(savi, clips(32, 4), own), own)
 
 
