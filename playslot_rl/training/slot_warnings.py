@@ -23,7 +23,7 @@ UNSEEN: Final = 0.3
 MAGNIFIED: Final = 1500
 """First steps with magnified frames that took slots off the plateau, of a stage that is three times as long or more."""
 FOREGROUND: Final = 30
-"""Weight with which goals and cubes of 20 to 40 pixels were drawn."""
+"""Weight with which goals and cubes of 4 to 40 pixels were drawn."""
 
 
 def slot_warnings(values: Mapping[str, float], savi: SAViConfig, stage: SlotsStageConfig) -> dict[str, str]:

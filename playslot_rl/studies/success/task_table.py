@@ -67,8 +67,9 @@ def _ahead(results: Sequence[Result], cells: Sequence[Result], reference: str | 
 
 def _worse(result: Result, reference: Result) -> set[str]:
     """Methods that are behind the reference's cell by an interval that leaves out 0."""
-    rows = [row for row in result["differences"] if row["protocol"] == "simulation" and row["better"] is False]
-    return {row["method"] for row in rows if all(row[name] == reference[name] for name in ("demos", "labels"))}
+    at = ("protocol", "demos", "labels")
+    rows = [row for row in result["differences"] if all(row[name] == reference[name] for name in at)]
+    return {row["method"] for row in rows if row["leaves_out_0"] and row["difference"] < 0}
 
 
 def _whole(cell: Result) -> bool:
