@@ -11,9 +11,12 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
+from playslot_rl.storage.checkpoints import source_commit
+
 TIMES = re.compile(r"(^|_)(seconds|began|started|ended|time|used|pulled|created|rate_fps|steps_per_second)(_|$)")
 """Keys of JSON files whose values are times."""
-OF_THE_DAY = ("command", "commit", "machine", "sittings")
+OF_THE_DAY = ("command", "commit", "commits", "trained_at", "machine", "sittings")
+"""The commit is unknown to a process that may open too few files to ask git."""
 SPENT = re.compile(r"\b\d+(\.\d+)? ?(s|ms|min|h|seconds|minutes)\b")
 PASSING = (".lock", ".log")
 """Names of a fingerprint's cache are made of times, too."""
@@ -48,7 +51,10 @@ def _content(path: Path) -> bytes:
         table = pq.ParquetFile(path).read()
         return repr((table.schema.remove_metadata(), table.to_pylist())).encode()
     if path.suffix in (".md", ".html"):
-        return SPENT.sub("some time", path.read_text()).encode()
+        text = path.read_text()
+        if commit := source_commit()[:12]:
+            text = text.replace(commit, "–")
+        return SPENT.sub("some time", text).encode()
     return path.read_bytes()
 
 
