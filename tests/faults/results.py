@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import re
@@ -51,11 +52,15 @@ def _content(path: Path) -> bytes:
         table = pq.ParquetFile(path).read()
         return repr((table.schema.remove_metadata(), table.to_pylist())).encode()
     if path.suffix in (".md", ".html"):
-        text = path.read_text()
-        if commit := source_commit()[:12]:
-            text = text.replace(commit, "–")
-        return SPENT.sub("some time", text).encode()
+        text, commit = path.read_text(), _commit()
+        return SPENT.sub("some time", text.replace(commit, "–") if commit else text).encode()
     return path.read_bytes()
+
+
+@functools.cache
+def _commit() -> str:
+    """As reports show it; git is asked once, not for every report."""
+    return source_commit()[:12]
 
 
 def _timeless(value: Any) -> Any:
