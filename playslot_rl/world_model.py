@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config import EnvConfig, ModelConfig
+from playslot_rl.config import EnvConfig, InverseDynamicsConfig, ModelConfig, PolicyConfig, SAViConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -42,7 +42,7 @@ class WorldModel(nn.Module):
         self.config = config
         self.env = env
         self.savi = SAVi(config.savi, env.image_size)
-        _require_slots(config)
+        require_slots(config.inverse_dynamics, config.savi)
         self.inverse_dynamics = InverseDynamics(config.inverse_dynamics, config.savi.slot_dim, env.action_dim)
         self.predictor = build_predictor(
             config.predictor, config.savi.slot_dim, self.inverse_dynamics.latent_dim, self.inverse_dynamics.per_slot
@@ -77,14 +77,14 @@ class WorldModel(nn.Module):
         return (self.config.savi.n_slots, width) if self.inverse_dynamics.per_slot else (width,)
 
 
-def _require_slots(config: ModelConfig) -> None:
+def require_slots(chooses: InverseDynamicsConfig | PolicyConfig, savi: SAViConfig) -> None:
     """Refuse numbers of slots that are not there, or that say nothing, by a ConfigError."""
-    chosen, n = config.inverse_dynamics.slots, config.savi.n_slots
-    if chosen and max(chosen) > n:
-        raise ConfigError(f"model.inverse_dynamics.slots: got {max(chosen)}, expected at most the {n} slots of SAVi")
-    if chosen and config.savi.initial != "learned":
+    key, chosen = f"{chooses.group}slots", chooses.slots
+    if chosen and max(chosen) > savi.n_slots:
+        raise ConfigError(f"{key}: got {max(chosen)}, expected at most the {savi.n_slots} slots of SAVi")
+    if chosen and savi.initial != "learned":
         raise ConfigError(
-            "model.inverse_dynamics.slots: got some with model.savi.initial=gaussian, whose slots change places from "
+            f"{key}: got some with model.savi.initial=gaussian, whose slots change places from "
             "episode to episode, expected none, or a SAVi of initial=learned"
         )
 

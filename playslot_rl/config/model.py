@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Final, Literal
 
 from playslot_rl.config.plain import check
 from playslot_rl.config.roles import (
@@ -21,6 +21,12 @@ from playslot_rl.config.roles import (
 )
 
 LatentMode = Literal["hybrid", "discrete", "continuous", "ground_truth", "none"]
+CHOSEN: Final = UNSAID | at_least(1, "numbers of slots from 1 on")
+"""Of a choice of slots."""
+
+
+def _check_once(sizes: InverseDynamicsConfig | PolicyConfig) -> None:
+    check(len(set(sizes.slots)) == len(sizes.slots), f"{sizes.group}slots", sizes.slots, "each slot once")
 
 
 @dataclass(frozen=True)
@@ -105,7 +111,7 @@ class InverseDynamicsConfig(Checked):
         dead_threshold: EMA cluster size under which a code is revived by a random latent.
         commitment: weight beta of the commitment term.
         sample: sample z at evaluation too.
-        slots: slots, counted from 1, whose change z tells; empty: all.
+        slots: those whose change z tells, from 1; none: all.
     """
 
     group = "model.inverse_dynamics."
@@ -122,13 +128,15 @@ class InverseDynamicsConfig(Checked):
     dead_threshold: float = field(default=1.0, metadata=NOT_NEGATIVE)
     commitment: float = field(default=0.25, metadata=NOT_NEGATIVE)
     sample: bool = False
-    slots: tuple[int, ...] = field(default=(), metadata=UNSAID | at_least(1, "numbers of slots from 1 on"))
+    slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        key, alone = f"{self.group}slots", not self.slots or self.variant == "single"
-        check(alone, key, self.slots, "none with variant=multi, which has a latent action for each slot")
-        check(len(set(self.slots)) == len(self.slots), key, self.slots, "each slot once")
+        alone = not self.slots or self.variant == "single"
+        check(
+            alone, f"{self.group}slots", self.slots, "none with variant=multi, which has a latent action for each slot"
+        )
+        _check_once(self)
 
     def seen(self, n: int) -> list[int]:
         """Of n slots, counted from 0, those whose change z tells."""
@@ -173,7 +181,8 @@ class PolicyConfig(Checked):
 
     Attributes:
         dim, layers, heads, head_dim, mlp_dim: the transformer.
-        whiten: it gives whitened coordinates; `behaviour.whiten` sets it where a policy is trained.
+        whiten: it gives whitened coordinates; `behaviour.whiten` sets it.
+        slots: those that it sees, from 1; none: all.
     """
 
     group = "model.policy."
@@ -183,6 +192,16 @@ class PolicyConfig(Checked):
     head_dim: int = field(default=64, metadata=COUNT)
     mlp_dim: int = field(default=1024, metadata=COUNT)
     whiten: bool = field(default=False, metadata=was(False))
+    slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_once(self)
+
+    @property
+    def of_frames(self) -> PolicyConfig:
+        """The same of a policy whose tokens are places in a frame, not slots."""
+        return replace(self, slots=())
 
 
 @dataclass(frozen=True)
@@ -193,9 +212,10 @@ class ActionDecoderConfig(Checked):
         hidden_dim: hidden width.
         state_dim, state_layers, state_heads: width, layers and heads of the slot encoder beside it, for
             `behaviour.decoder_state`.
-        whiten: its inputs are whitened; `behaviour.whiten` sets it where a decoder is trained.
-        reads_slots: there is a slot encoder; `behaviour.decoder_state` sets it likewise.
-        state_dropout: fraction of the training rows in which the network that reads slots goes without them.
+        whiten: its inputs are whitened; `behaviour.whiten` sets it.
+        reads_slots: there is a slot encoder; `behaviour.decoder_state` sets it.
+        slots: `model.policy.slots` sets it.
+        state_dropout: fraction of training rows in which the network that reads slots goes without.
     """
 
     group = "model.action_decoder."
@@ -206,6 +226,7 @@ class ActionDecoderConfig(Checked):
     state_dropout: float = field(default=0.5, metadata=was(0.5) | below_one("0 to below 1"))
     whiten: bool = field(default=False, metadata=was(False))
     reads_slots: bool = field(default=False, metadata=was(False))
+    slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
 
     def __post_init__(self) -> None:
         super().__post_init__()

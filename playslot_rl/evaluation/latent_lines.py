@@ -212,8 +212,13 @@ def _telling_line(model: InverseDynamics, slots: Sequence[Mapping[str, Any]]) ->
     found = line("telling_slots", share, f"slots that tell, with their R²: {told}")
     if found.verdict == "good" or not telling or len(telling) == len(seen) or model.per_slot:
         return found
-    numbers = ",".join(str(one["slot"]) for one in telling)
-    return replace(found, note=f"{found.note}; model.inverse_dynamics.slots=[{numbers}] leaves out the others")
+    # What hardly moves may be a goal, which a policy has to see.
+    kept = [one for one in slots if one["r2"] > NOTHING or one["change"] * len(slots) <= 1]
+    latents, policy = (",".join(str(one["slot"]) for one in chosen) for chosen in (telling, kept))
+    note = f"{found.note}; model.inverse_dynamics.slots=[{latents}] leaves out the others"
+    if len(kept) < len(slots):
+        note += f", model.policy.slots=[{policy}] those that move most and tell nothing"
+    return replace(found, note=note)
 
 
 def _noise_size(noisy: Floats, real: Floats) -> Line:

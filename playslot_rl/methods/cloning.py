@@ -62,6 +62,18 @@ class Seen(NamedTuple):
     moves: Transitions
 
 
+def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
+    """With a decoder that reads the policy's features where `behaviour.decoder_state` says so."""
+    decoder = replace(config.model.action_decoder, reads_slots=config.behaviour.decoder_state)
+    return replace(model, action_decoder=decoder)
+
+
+def slot_sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
+    """The same, of a policy that sees slots: the decoder reads those that it sees."""
+    decoder = sizes(config, model).action_decoder
+    return replace(model, action_decoder=replace(decoder, slots=config.model.policy.slots))
+
+
 class LatentCloning(ABC):
     """Policy and decoder, untrained, with the stages that train them one after the other; a DataError for
     demonstrations without actions, or in which nothing moves, or nothing in the labelled ones.
@@ -79,6 +91,8 @@ class LatentCloning(ABC):
 
     kind: type[RegressionStage] = RegressionStage
     """Of the policy's stage."""
+
+    sizes = staticmethod(sizes)
 
     def __init__(
         self,
@@ -124,7 +138,7 @@ class LatentCloning(ABC):
 
     def new_decoder(self, latent_dim: int, state_dim: int) -> ActionDecoder:
         """One that may read the policy's features, of that width."""
-        model = sizes(self.config, self.config.model)
+        model = self.sizes(self.config, self.config.model)
         return ActionDecoder(model.action_decoder, latent_dim, self.config.env.action_dim, state_dim).to(self.device)
 
     def decoding(
@@ -185,12 +199,6 @@ def inferred(
 ) -> Tensor:
     """What a model in evaluation mode infers (M, ...) from what `read` gives of rows (M, F), some at a time."""
     return torch.cat([infer(read(some).to(device)) for some in in_batches(rows)])
-
-
-def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
-    """With a decoder that reads the policy's features where `behaviour.decoder_state` says so."""
-    decoder = replace(config.model.action_decoder, reads_slots=config.behaviour.decoder_state)
-    return replace(model, action_decoder=decoder)
 
 
 def moving_examples(

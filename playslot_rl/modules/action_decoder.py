@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import ActionDecoderConfig
 from playslot_rl.modules.action_range import ActionRange
-from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.modules.transformer import SlotTokenEncoder, chosen_slots
 from playslot_rl.modules.whitening import Whitening
 from playslot_rl.runtime.shares import own_noise
 
@@ -62,7 +62,7 @@ class ActionDecoder(nn.Module):
         self.encoder: SlotTokenEncoder | None = None
         if config.reads_slots:
             self.register_buffer("trusts_slots", torch.tensor(True))
-            self.dropout = config.state_dropout
+            self.dropout, self.slots = config.state_dropout, config.slots
             self.encoder = SlotTokenEncoder(slot_dim, width, config.state_layers, heads, width // heads, 2 * width)
             self.seeing = _mlp(latent_dim + width, h, action_dim)
 
@@ -95,7 +95,7 @@ class ActionDecoder(nn.Module):
         inputs = (z - self.mean) / self.scale if self.whitening is None else self.whitening(z)
         if self.encoder is None or slots is None or not (self.training or self.acts_on_slots):
             return self.action_range.pinned(torch.tanh(self.layers(inputs)))
-        state = self.encoder(slots)
+        state = self.encoder(chosen_slots(slots, self.slots))
         if self.training and self.dropout:
             device = state.device  # the draw may be kept, and is not to keep the state
             drawn = own_noise((*state.shape[:-1], 1), lambda shape: torch.rand(shape, device=device))

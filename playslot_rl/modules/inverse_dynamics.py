@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from playslot_rl.config import InverseDynamicsConfig
 from playslot_rl.modules.action_range import ActionRange
 from playslot_rl.modules.quantizer import ActionQuantizer
-from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.modules.transformer import SlotTokenEncoder, chosen_slots
 from playslot_rl.runtime.precision import full_precision
 from playslot_rl.runtime.shares import own_noise
 
@@ -110,9 +110,7 @@ class InverseDynamics(nn.Module):
 
     def scene_dynamics(self, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the scene dynamics of each frame: slots (..., N, D) -> two of (..., [N,] Z)."""
-        if self.config.slots:
-            slots = slots[..., self.config.seen(slots.shape[-2]), :]
-        h = self.encoder(slots)
+        h = self.encoder(chosen_slots(slots, self.config.slots))
         with full_precision(slots.device.type):  # z is a difference of two means that are nearly equal
             h = h.to(slots.dtype)
             return self.to_mean(h), F.softplus(self.to_variance(h)) + 1e-6

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from playslot_rl.config import PolicyConfig
 from playslot_rl.modules.action_range import ActionRange
-from playslot_rl.modules.transformer import SlotTokenEncoder
+from playslot_rl.modules.transformer import SlotTokenEncoder, chosen_slots
 from playslot_rl.modules.whitening import Whitening
 
 
@@ -30,9 +30,10 @@ class Decides(Protocol):
 
 
 class LatentPolicy(nn.Module):
-    """Latent action from the slots of one frame.
+    """Latent action from the slots of one frame, or from some of them (`config.slots`).
 
-    Note: with `whiten` the head gives whitened coordinates of the latent action, which is what is cloned
+    Note: the paper's policy sees all slots. What moves by itself says nothing of what to do, and misleads a policy of
+    few videos. With `whiten` the head gives whitened coordinates of the latent action, which is what is cloned
     (`behaviour.whiten`); the paper clones latents as they are.
 
     Args:
@@ -58,11 +59,12 @@ class LatentPolicy(nn.Module):
         self.whitening = Whitening(out_dim) if whiten else None
         if acts:
             self.action_range = ActionRange(out_dim)
-        self.tasks = tasks
+        self.tasks, self.slots = tasks, c.slots
         self.told = nn.Embedding(tasks, slot_dim) if tasks else None
 
     def forward(self, slots: Tensor, task: Tensor | None = None) -> Tensor:
         """Slots (..., N, D), and the task int64 (..., 1) where it is told, to latent actions (..., Z)."""
+        slots = chosen_slots(slots, self.slots)
         if self.told is not None:
             assert task is not None
             slots = torch.cat((slots, self.told(task)), dim=-2)

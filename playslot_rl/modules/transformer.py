@@ -12,7 +12,7 @@ And the [ACT] transformer of InvDyn_S and of the latent policy:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -106,6 +106,11 @@ class TransformerBlock(nn.Module):
     def _heads(self, x: Tensor) -> Tensor:
         """(B, S, inner) to (B, heads, S, head_dim)."""
         return x.view(*x.shape[:2], self.heads, self.head_dim).transpose(1, 2)
+
+
+def chosen_slots(slots: Tensor, numbers: Sequence[int]) -> Tensor:
+    """Of slots (..., N, D) those of these numbers, from 1, (..., n, D); all where there are none."""
+    return slots[..., [number - 1 for number in numbers], :] if numbers else slots
 
 
 class SlotTokenEncoder(nn.Module):

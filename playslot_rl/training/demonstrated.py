@@ -19,7 +19,7 @@ from playslot_rl.modules.savi import SAVi
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
-from playslot_rl.world_model import module_device
+from playslot_rl.world_model import module_device, require_slots
 
 ParsedVideos = tuple[EpisodeFrames, npt.NDArray[np.float32]]
 
@@ -28,8 +28,10 @@ def demonstration_views(
     config: ExperimentConfig, demos: DemonstrationSplit, savi: SAVi, slots_print: str
 ) -> tuple[list[ParsedVideos], list[ParsedVideos]]:
     """Demonstrations and their shifted copies (`behaviour.shift`), each with the slots (F, N, D) of its frames, and the
-    held-out ones, none or one, likewise; cached on disk by the fingerprint of SAVi's checkpoint.
+    held-out ones, none or one, likewise; cached on disk by the fingerprint of SAVi's checkpoint. A ConfigError where
+    the policy is to see slots that SAVi has not.
     """
+    require_slots(config.model.policy, savi.config)
 
     def parse(frames: EpisodeFrames) -> npt.NDArray[np.float32]:
         return slot_cache(

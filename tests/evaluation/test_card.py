@@ -128,6 +128,7 @@ def test_a_slot_that_moves_by_itself_is_told_from_those_that_the_robot_moves(
     assert line.verdict == verdict
     assert line.value == pytest.approx(share, abs=0.01)
     assert ("model.inverse_dynamics.slots=[1,2] leaves out" in line.note) == (chosen == ())
+    assert ("model.policy.slots=[1,2,4] those that move most" in line.note) == (verdict == "bad")
     assert [round(one["r2"]) for one in details["telling_slots"]] == [1, 1, *[0] * (n - 2)]
     assert sum(one["change"] for one in details["telling_slots"]) == pytest.approx(1)
 

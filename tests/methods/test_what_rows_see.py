@@ -9,12 +9,16 @@ from typing import Any, Literal
 from unittest.mock import patch
 
 import pytest
+import torch
 from stages import few_videos
+from tensordict import TensorDict
 
 from playslot_rl import keys
+from playslot_rl.acting.actor import SlotActor
 from playslot_rl.config import plugins
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
+from playslot_rl.errors import ConfigError
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.recipes import train_baseline, train_dynamics, train_slots
 from playslot_rl.runs import Run
@@ -112,8 +116,8 @@ class Trainings:
             actions[start : start + 8] = -0.9 * actions[start : start + 8]
         return replace(found, actions=actions)
 
-    def train(self, name: str, altered: slice = slice(0)) -> Run:
-        """A run of a method; the actions of some demonstrations are others."""
+    def train(self, name: str, altered: slice = slice(0), *more: str) -> Run:
+        """A run of a method; the actions of some demonstrations are others, and so are `more` keys."""
         shared = ["preset=smoke", "env=button_press", "data.root=videos", "device=cpu", "logging.backend=none"]
         shared += [f"data.cache={self.folder / 'cache'}", "behaviour.oracle=false"]
         shared += [f"behaviour.labelled_demos={LABELLED}", "baselines.resnet_oracle.steps=8"]  # a row of each
@@ -121,9 +125,9 @@ class Trainings:
         if not self.world.is_dir():
             for recipe in (train_slots, train_dynamics):
                 recipe.main(compose([*shared, f"out={self.world}"]))
-        self.altered, out = altered, self.folder / f"{name}-{altered.start}-{altered.stop}"
+        self.altered, out = altered, self.folder / "-".join((name, str(altered.start), str(altered.stop), *more))
         if not out.is_dir():
-            train_baseline.main(compose([*shared, f"method={name}", f"run={self.world}", f"out={out}"]))
+            train_baseline.main(compose([*shared, f"method={name}", f"run={self.world}", f"out={out}", *more]))
         return Run(out)
 
 
@@ -164,3 +168,37 @@ def test_it_acts_on_so_many_frames_and_reads_proprioception_where_the_table_says
     memory = actor.reset([0])
     seen = memory[keys.FRAME_HISTORY].shape[1] if keys.FRAME_HISTORY in actor.memory_keys else 1
     assert seen == TABLE[name].frames
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", [name for name in OFFLINE if TABLE[name].acts_on == "slots"])
+def test_it_acts_on_the_slots_that_its_policy_is_to_see(name: str, trainings: Trainings) -> None:
+    actor = plugins.call(METHODS[name].load.actor, trainings.train(name, slice(0), "model.policy.slots=[3,1]"), "cpu")
+    assert isinstance(actor, SlotActor)
+    for decoder in actor.modules():
+        if isinstance(decoder, ActionDecoder) and decoder.reads_slots:
+            decoder.trusts_slots.fill_(True)
+    seen = torch.randn(1, *actor.reset([0])[keys.SLOT_STATE].shape[1:])
+    acted = actor.heads(TensorDict({keys.SLOTS: seen}, [1]))[keys.ACTION]
+    changed = []
+    for n in range(seen.shape[1]):
+        other = seen.clone()
+        other[:, n] = torch.randn(seen.shape[2])
+        changed.append(not torch.equal(actor.heads(TensorDict({keys.SLOTS: other}, [1]))[keys.ACTION], acted))
+    assert changed == [n in (0, 2) for n in range(seen.shape[1])]
+
+
+@pytest.mark.integration
+def test_a_policy_of_frames_is_not_told_of_slots(trainings: Trainings) -> None:
+    run = trainings.train("resnet_bc", slice(0), "model.policy.slots=[3,1]")
+    plain = trainings.train("resnet_bc")
+    of = METHODS["resnet_bc"].last.name
+    weights = (trained.folder / of / "checkpoint" / "weights.safetensors" for trained in (run, plain))
+    assert len({path.read_bytes() for path in weights}) == 1
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", [name for name in OFFLINE if TABLE[name].acts_on == "slots"])
+def test_slots_that_there_are_not_are_refused(name: str, trainings: Trainings) -> None:
+    with pytest.raises(ConfigError, match=r"model\.policy\.slots: got 9, expected at most the \d slots of SAVi"):
+        trainings.train(name, slice(0), "model.policy.slots=[9]")

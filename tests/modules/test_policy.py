@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
 import torch
 
 from playslot_rl.config import ActionDecoderConfig, PolicyConfig
@@ -31,6 +34,27 @@ def test_the_policy_sees_every_slot() -> None:
         other = slots.clone()
         other[:, n] = torch.randn(12)  # a constant would vanish in the layer norm
         assert not torch.allclose(policy()(other), expected, atol=1e-5)
+
+
+def test_policy_and_decoder_see_the_chosen_slots_alone() -> None:
+    torch.manual_seed(0)
+    chosen, slots, task = (3, 1), torch.randn(2, 4, 12), torch.tensor([[0], [1]])
+    sizes = ActionDecoderConfig(16, state_dim=8, state_heads=2, reads_slots=True)
+    whole, some = (LatentPolicy(replace(SMALL, slots=seen), 12, 6, tasks=2).eval() for seen in ((), chosen))
+    reads, reads_some = (ActionDecoder(replace(sizes, slots=seen), 6, 4, 12).eval() for seen in ((), chosen))
+    some.load_state_dict(whole.state_dict())
+    reads_some.load_state_dict(reads.state_dict())
+    few = slots[:, [2, 0]]
+    z = whole(few, task)
+    torch.testing.assert_close(some(slots, task), z)
+    torch.testing.assert_close(reads_some(z, slots), reads(z, few))
+    assert not torch.allclose(whole(slots, task), z)
+    assert not torch.allclose(reads(z, slots), reads(z, few))
+
+
+def test_a_slot_is_chosen_once() -> None:
+    with pytest.raises(ValueError, match=r"model\.policy\.slots: got .*expected each slot once"):
+        replace(SMALL, slots=(2, 2))
 
 
 def test_the_policy_takes_any_leading_shape_row_by_row() -> None:

@@ -115,7 +115,7 @@ class CodePolicy(nn.Module):
         width, levels = code
         side = image_size // 2**levels
         self.position = nn.Parameter(torch.randn(side * side, width) * 0.02)
-        self.head = LatentPolicy(config, width, out_dim, acts=True)
+        self.head = LatentPolicy(config.of_frames, width, out_dim, acts=True)
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("std", torch.ones(width))
 

@@ -44,7 +44,7 @@ POLICY: Final = StageSpec(
     data="demos",
     parts=f"{_PARTS}:policy",
     also=("behaviour.policy_from",),
-    sizes="playslot_rl.methods.cloning:sizes",
+    sizes="playslot_rl.methods.cloning:slot_sizes",
 )  # fmt: skip
 LAPO_SLOTS: Final = Method(
     NAME, ("LAPO on slots",), Style(5, "$S$"), LAPOSlotsConfig, (MODEL, POLICY),

@@ -22,7 +22,7 @@ from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred
+from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred, slot_sizes
 from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
 from playslot_rl.methods.lapo.slots_method import MODEL, LAPOSlotsConfig
 from playslot_rl.methods.lapo.training import TWO, LAPOModelStage, on_pairs
@@ -49,6 +49,8 @@ def model(record: StageRecord) -> Training:
 
 class LAPOSlotsBehaviour(LatentCloning):
     """See `LatentCloning`: on slots, of what moves in them, and with shifted copies."""
+
+    sizes = staticmethod(slot_sizes)
 
     def __init__(self, record: StageRecord) -> None:
         config, device, demos = record.config, record.device, record.demos

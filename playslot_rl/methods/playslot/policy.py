@@ -16,6 +16,7 @@ from playslot_rl.data.demonstrations import (
 )
 from playslot_rl.data.slot_cache import SlotRows
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.methods.cloning import slot_sizes
 from playslot_rl.runs.opening import require_task
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import cloned, demonstration_views, policy_taken_over
@@ -28,9 +29,9 @@ from playslot_rl.world_model import Agent
 
 
 def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
-    own, typed = config.behaviour, config.model
-    decoder = replace(typed.action_decoder, whiten=own.whiten, reads_slots=own.decoder_state)
-    return replace(model, policy=replace(typed.policy, whiten=own.whiten), action_decoder=decoder)
+    whiten, decoder = config.behaviour.whiten, slot_sizes(config, model).action_decoder
+    policy = replace(config.model.policy, whiten=whiten)
+    return replace(model, policy=policy, action_decoder=replace(decoder, whiten=whiten))
 
 
 def training(record: StageRecord) -> Training:

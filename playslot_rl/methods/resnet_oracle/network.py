@@ -51,7 +51,7 @@ class ResNetPolicy(nn.Module):
         trunk.avgpool, trunk.fc = nn.Identity(), nn.Identity()
         self.trunk, self.frames = trunk, frames
         self.position = nn.Parameter(torch.randn(frames * (image_size // 32) ** 2, WIDTH) * 0.02)
-        self.head = LatentPolicy(config, WIDTH, out_dim, acts=True)
+        self.head = LatentPolicy(config.of_frames, WIDTH, out_dim, acts=True)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
