@@ -102,8 +102,8 @@ class SlotActor(Actor):
     with the first episode's seed; learned ones draw nothing.
     """
 
-    def __init__(self, savi: SAVi, *heads: TensorDictModuleBase, tasks: int = 0) -> None:
-        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *([keys.TASK] if tasks else [])))
+    def __init__(self, savi: SAVi, *heads: TensorDictModuleBase, memory: Sequence[str] = (), tasks: int = 0) -> None:
+        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *memory, *([keys.TASK] if tasks else [])))
         self.tasks = tasks
         self._slots = (savi.config.n_slots, savi.config.slot_dim)
         self.parser = frame_parser_module(savi)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows, told
+from playslot_rl.acting.belief import BeliefActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
@@ -23,6 +24,8 @@ from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_
 
 def playslot_actor(agent: Agent) -> SlotActor:
     """Parse with SAVi's recurrent state, choose a latent action, decode it (paper, section "Learning behaviours")."""
+    if agent.policy.gain < 1:
+        return BeliefActor(agent)
     heads = (latent_policy_module(agent.policy), action_decoder_module(agent.action_decoder))
     return SlotActor(agent.world_model.savi, *heads, tasks=agent.policy.tasks)
 

@@ -183,6 +183,7 @@ class PolicyConfig(Checked):
         dim, layers, heads, head_dim, mlp_dim: the transformer.
         whiten: it gives whitened coordinates; `behaviour.whiten` sets it.
         slots: those that it sees, from 1; none: all.
+        gain: `behaviour.gain` sets it.
     """
 
     group = "model.policy."
@@ -193,6 +194,7 @@ class PolicyConfig(Checked):
     mlp_dim: int = field(default=1024, metadata=COUNT)
     whiten: bool = field(default=False, metadata=was(False))
     slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
+    gain: float = field(default=1.0, metadata=UNSAID | between(0, 1, "0 to 1"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

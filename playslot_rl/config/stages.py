@@ -25,7 +25,7 @@ Execution = Literal["auto", "eager", "graph"]
 
 AFTER_CLONING: Final = (
     "labelled_demos", "decoder_inputs", "decoder_state", "decoder_steps", "decoder_lr", "finetune_steps",
-    "finetune_labels", "finetune_lr", "policy_from",
+    "finetune_labels", "finetune_lr", "policy_from", "gain",
 )  # fmt: skip
 """Settings of the behaviour stage for what comes after the policy."""
 DECODING: Final = tuple(
@@ -161,8 +161,8 @@ class BehaviourStageConfig(StageConfig):
         labelled_demos: demonstrations whose real actions the action decoder may see.
         parsed: clone from the slots that SAVi parses; false is there to be measured, and leaves the predicted ones.
         imagined: also clone from slots that cOCVP predicts along each demonstration.
-        loss: `l2` (paper) or `l1`, of policy, oracle and decoder. Where an expert switches at once between opposite
-            actions, the mean that `l2` finds is neither, and the policy dithers; the median is one of them.
+        loss: `l2` (paper) or `l1`, of policy, oracle and decoder. Where an expert switches between opposite
+            actions, the mean of `l2` is neither, and the policy dithers.
         slot_noise: standard deviation of Gaussian noise added to the slots that policy and oracle clone from (0 in the
             paper); slots have a standard deviation of about 0.7, and a prediction is about 0.03 off.
         shift: policy, oracle and decoder also learn from copies of the demonstrations moved by so many pixels, with the
@@ -171,25 +171,23 @@ class BehaviourStageConfig(StageConfig):
         trim: slot motion, the RMS change of the slots to the next frame, up to which a transition counts as still and
             is left out by all that clone from slots; read off the videos alone. 0 keeps every row (paper).
         trim_pixels: the same for those that clone from frames: the RMS change of the pixels, in [0, 1].
-        trim_margin: still transitions kept after each stretch of motion, so that stopping is learned, which may also
-            come
-            too early; 0 keeps none.
+        trim_margin: still transitions kept after each stretch of motion, so that stopping is learned; 0 keeps none.
         whiten: clone the latents in whitened coordinates (`playslot_rl.modules.whitening`), where each direction that
             they vary in weighs the same; false clones them as they are (paper).
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t), of LAPO and CADDY the policy's features:
-            the same change of the image asks for different actions in different places. From very few labels that is
-            not learned, so a decoder of the first half of them is first tried on the second, with the slots and
-            without. False reads z_t alone (paper).
+            the same change of the image asks for different actions in different places. From few labels that is not
+            learned: a decoder of their first half is first tried on the second, with slots and without. False reads z_t alone (paper).
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.
         finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the
             policy goes on cloning all rows meanwhile. 0 has none (paper).
         finetune_labels: labelled demonstrations from which on that is done: with five the closed loop loses by it.
         finetune_lr: their base learning rate.
-        policy_from: run whose finished policy training is taken over where it is the same one but for labels and
-            decoder; another, or none, is trained here.
+        policy_from: run whose finished policy training is taken over where only what follows it differs; otherwise one
+            is trained here.
         oracle: also train the slot oracle (same network on the real actions of all demos).
+        gain: the policy acts on predicted slots, corrected by this share of the parsed ones' difference (1: paper).
     """
 
     group = "behaviour."
@@ -213,6 +211,7 @@ class BehaviourStageConfig(StageConfig):
     finetune_lr: float = field(default=2e-4, metadata=was(2e-4) | above_zero(largest=1e40))
     policy_from: str = field(default="", metadata=role("machine", "folder"))
     oracle: bool = True
+    gain: float = field(default=1.0, metadata=UNSAID | between(0, 1, "0 to 1"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

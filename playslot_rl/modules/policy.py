@@ -41,6 +41,9 @@ class LatentPolicy(nn.Module):
         whiten: have a `whitening`, to be fitted before training.
         acts: it gives real actions, and has their `action_range`.
         tasks: how many tasks it is told apart; 0 for one, of which nothing is said.
+
+    Attributes:
+        gain: of PlaySlot's actor (`acting.belief`).
     """
 
     def __init__(
@@ -59,7 +62,7 @@ class LatentPolicy(nn.Module):
         self.whitening = Whitening(out_dim) if whiten else None
         if acts:
             self.action_range = ActionRange(out_dim)
-        self.tasks, self.slots = tasks, c.slots
+        self.tasks, self.slots, self.gain = tasks, c.slots, c.gain
         self.told = nn.Embedding(tasks, slot_dim) if tasks else None
 
     def forward(self, slots: Tensor, task: Tensor | None = None) -> Tensor:

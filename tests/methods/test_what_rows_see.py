@@ -15,6 +15,7 @@ from tensordict import TensorDict
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import SlotActor
+from playslot_rl.acting.belief import BeliefActor
 from playslot_rl.config import plugins
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS
@@ -202,3 +203,13 @@ def test_a_policy_of_frames_is_not_told_of_slots(trainings: Trainings) -> None:
 def test_slots_that_there_are_not_are_refused(name: str, trainings: Trainings) -> None:
     with pytest.raises(ConfigError, match=r"model\.policy\.slots: got 9, expected at most the \d slots of SAVi"):
         trainings.train(name, slice(0), "model.policy.slots=[9]")
+
+
+@pytest.mark.integration
+def test_a_gain_changes_how_playslot_acts_and_no_weights(trainings: Trainings) -> None:
+    run, plain = trainings.train("playslot", slice(0), "behaviour.gain=0.25"), trainings.train("playslot")
+    actor = plugins.call(METHODS["playslot"].load.actor, run, "cpu")
+    assert isinstance(actor, BeliefActor)
+    assert actor.policy.gain == 0.25
+    weights = (trained.folder / "policy" / "checkpoint" / "weights.safetensors" for trained in (run, plain))
+    assert len({path.read_bytes() for path in weights}) == 1

@@ -30,7 +30,7 @@ from playslot_rl.world_model import Agent
 
 def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
     whiten, decoder = config.behaviour.whiten, slot_sizes(config, model).action_decoder
-    policy = replace(config.model.policy, whiten=whiten)
+    policy = replace(config.model.policy, whiten=whiten, gain=config.behaviour.gain)
     return replace(model, policy=policy, action_decoder=replace(decoder, whiten=whiten))
 
 
