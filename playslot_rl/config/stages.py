@@ -177,7 +177,8 @@ class BehaviourStageConfig(StageConfig):
         decoder_inputs: `inverse_dynamics` (InvDyn's latents; paper), `policy` (the policy's outputs) or `both`.
         decoder_state: the decoder also reads the slots, a_t = D_a(z_t, S_t), of LAPO and CADDY the policy's features:
             the same change of the image asks for different actions in different places. From few labels that is not
-            learned: a decoder of their first half is first tried on the second, with slots and without. False reads z_t alone (paper).
+            learned: a decoder of their first half is first tried on the second, with slots and without. False
+            reads z_t alone (paper).
         decoder_steps: optimiser steps of the action decoder.
         decoder_lr: its base learning rate; the rest of `optim` is shared.
         finetune_steps: optimiser steps after that, of policy and decoder together, on the labelled rows' actions; the
