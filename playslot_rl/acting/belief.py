@@ -5,7 +5,7 @@
 s_t is what SAVi parses. K = 1 is the paper's policy, which has no memory; K = 0 looks at the first frame alone, as
 imagination does. Between them the policy knows how far it has come where a frame does not show it, or shows it badly.
 
-Note: not in the paper.
+Note: not in the paper. A policy in one of TorchRL's environments (`acting.simulation`) sees parsed slots.
 
 Shapes: n episodes, N slots, D slot width, Z latent-action width, C context frames.
 """

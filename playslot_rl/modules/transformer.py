@@ -110,7 +110,8 @@ class TransformerBlock(nn.Module):
 
 def chosen_slots(slots: Tensor, numbers: Sequence[int]) -> Tensor:
     """Of slots (..., N, D) those of these numbers, from 1, (..., n, D); all where there are none."""
-    return slots[..., [number - 1 for number in numbers], :] if numbers else slots
+    # Not by a list as index, which a captured step would have to copy to the GPU.
+    return torch.stack([slots[..., number - 1, :] for number in numbers], dim=-2) if numbers else slots
 
 
 class SlotTokenEncoder(nn.Module):
