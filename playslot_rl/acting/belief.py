@@ -20,7 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import SlotActor
-from playslot_rl.world_model import Agent, action_decoder_module, dynamics_module
+from playslot_rl.world_model import Agent, action_decoder_module, dynamics_module, latent_policy_module
 
 PAST: Final = (keys.LATENT_ACTION, keys.SLOT_HISTORY, keys.ACTION_HISTORY, keys.HISTORY_LENGTH)
 """What `dynamics_module` reads: beliefs and latents of the steps before."""
@@ -33,7 +33,8 @@ class BeliefActor(SlotActor):
         super().__init__(
             agent.world_model.savi, action_decoder_module(agent.action_decoder), memory=PAST, tasks=agent.policy.tasks
         )
-        self.policy, self.dynamics = agent.policy, dynamics_module(agent.world_model)
+        self.policy, self.dynamics = latent_policy_module(agent.policy), dynamics_module(agent.world_model)
+        self.gain = agent.policy.gain
         self._context, self._latent = agent.world_model.config.predictor.context, agent.world_model.latent_shape
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
@@ -46,13 +47,11 @@ class BeliefActor(SlotActor):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = self.parser(tensordict)
-        parsed, past = seen[keys.SLOTS], seen.select(*PAST)
-        first = past[keys.HISTORY_LENGTH] == 0
-        past[keys.HISTORY_LENGTH] = past[keys.HISTORY_LENGTH].clamp(min=1)  # of a first frame nothing is predicted
-        moved = self.dynamics(past)
-        predicted = moved[keys.SLOTS]
-        belief = torch.where(first[..., None], parsed, predicted + self.policy.gain * (parsed - predicted))
-        moved[keys.SLOT_HISTORY][:, -1] = belief
+        parsed, moved = seen[keys.SLOTS], seen.copy()
+        first = moved[keys.HISTORY_LENGTH] == 0
+        moved[keys.HISTORY_LENGTH] = moved[keys.HISTORY_LENGTH].clamp(min=1)  # of a first frame nothing is predicted
+        predicted = self.dynamics(moved)[keys.SLOTS]
+        moved[keys.SLOTS] = torch.where(first[..., None], parsed, predicted + self.gain * (parsed - predicted))
+        moved[keys.SLOT_HISTORY][:, -1] = moved[keys.SLOTS]
         moved[keys.HISTORY_LENGTH] = torch.where(first, 1, moved[keys.HISTORY_LENGTH])
-        moved[keys.LATENT_ACTION] = self.policy.decide(belief, *([seen[keys.TASK]] if self.tasks else []))
-        return self.heads(seen.update(moved.select(*PAST)))
+        return self.heads(self.policy(moved).set(keys.SLOTS, parsed))

@@ -92,8 +92,6 @@ class LatentCloning(ABC):
     kind: type[RegressionStage] = RegressionStage
     """Of the policy's stage."""
 
-    sizes = staticmethod(sizes)
-
     def __init__(
         self,
         config: ExperimentConfig,
@@ -138,7 +136,7 @@ class LatentCloning(ABC):
 
     def new_decoder(self, latent_dim: int, state_dim: int) -> ActionDecoder:
         """One that may read the policy's features, of that width."""
-        model = self.sizes(self.config, self.config.model)
+        model = sizes(self.config, self.config.model)
         return ActionDecoder(model.action_decoder, latent_dim, self.config.env.action_dim, state_dim).to(self.device)
 
     def decoding(

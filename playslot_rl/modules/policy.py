@@ -32,8 +32,8 @@ class Decides(Protocol):
 class LatentPolicy(nn.Module):
     """Latent action from the slots of one frame, or from some of them (`config.slots`).
 
-    Note: the paper's policy sees all slots. What moves by itself says nothing of what to do, and misleads a policy of
-    few videos. With `whiten` the head gives whitened coordinates of the latent action, which is what is cloned
+    Note: the paper's policy sees all slots; what moves by itself says nothing of what to do (docs/results/tasks.md).
+    With `whiten` the head gives whitened coordinates of the latent action, which is what is cloned
     (`behaviour.whiten`); the paper clones latents as they are.
 
     Args:

@@ -22,10 +22,11 @@ from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.losses.behaviour import BehaviourLoss
-from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred, slot_sizes
+from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred
 from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
 from playslot_rl.methods.lapo.slots_method import MODEL, LAPOSlotsConfig
 from playslot_rl.methods.lapo.training import TWO, LAPOModelStage, on_pairs
+from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import demonstration_views
@@ -50,8 +51,6 @@ def model(record: StageRecord) -> Training:
 class LAPOSlotsBehaviour(LatentCloning):
     """See `LatentCloning`: on slots, of what moves in them, and with shifted copies."""
 
-    sizes = staticmethod(slot_sizes)
-
     def __init__(self, record: StageRecord) -> None:
         config, device, demos = record.config, record.device, record.demos
         own: LAPOSlotsConfig = config.baselines.lapo_slots
@@ -68,7 +67,8 @@ class LAPOSlotsBehaviour(LatentCloning):
         super().__init__(config, demos, device, 0, schedule, config.behaviour.loss)
         with global_seed(config.seed, 0, record.name):
             self.policy = LatentPolicy(config.model.policy, width, own.latent_dim).to(device)
-            self.decoder = self.new_decoder(own.latent_dim, width)
+            decoder = record.groups["model"].action_decoder  # which reads the slots that the policy sees
+            self.decoder = ActionDecoder(decoder, own.latent_dim, config.env.action_dim, width).to(device)
 
     def infer(self, source: EpisodeFrames, moves: Transitions) -> Tensor:
         slots, rows = self.parsed[id(source)], Ends.of(source).past(moves.rows + 1, self.own.frames)

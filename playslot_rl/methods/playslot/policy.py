@@ -44,7 +44,7 @@ def training(record: StageRecord) -> Training:
     world = record.world.load_world_model(device)
     if (config.env.tasks or world.env.tasks) and not world.env.serves(config.env):
         require_task(config, world.env, ("task",))
-    world.config, world.env = sizes(config, world.config), record.groups["env"]
+    world.config, world.env = record.groups["model"], record.groups["env"]
     with global_seed(config.seed, 0, "policy"):
         agent = Agent.untrained(world, oracle=behaviour.oracle).to(device)
     views, others = demonstration_views(config, split, world.savi, record.prints["slots"])
