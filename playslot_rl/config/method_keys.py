@@ -15,7 +15,7 @@ from playslot_rl.config.compare_video import method_of
 from playslot_rl.config.experiment import ExperimentConfig
 from playslot_rl.config.methods import METHODS, Method, stage_named
 from playslot_rl.config.plain import flatten, to_dict
-from playslot_rl.config.roles import keys_of
+from playslot_rl.config.roles import declared, keys_of
 from playslot_rl.config.spelling import typed_value
 from playslot_rl.config.stage_spec import BASELINES, StageSpec
 from playslot_rl.errors import ConfigError
@@ -122,9 +122,13 @@ def _stages(method: Method) -> tuple[StageSpec, ...]:
 
 
 def require_read(config: ExperimentConfig, typed: Mapping[str, Any], command: str) -> None:
-    """Refuse what was typed, by dotted names, that no method of the command reads, by a ConfigError."""
-    methods = chosen(config, command)
+    """Refuse what was typed, by dotted names, that another key sets, or that no method of the command reads, by a
+    ConfigError.
+    """
+    methods, setters = chosen(config, command), declared(ExperimentConfig, "set_by")
     for key, value in typed.items():
+        if key in setters:
+            raise ConfigError(f"{key}: got {typed_value(value)}, expected none: {setters[key]}= sets it")
         if methods is not None and not methods.reads(key):
             name, text = key.removeprefix("compare."), typed_value(value)
             got = text.strip("[]") if name in ("demos", "labels") else text

@@ -16,6 +16,7 @@ from playslot_rl.config.roles import (
     at_least,
     below_one,
     between,
+    set_by,
     was,
     within,
 )
@@ -192,9 +193,9 @@ class PolicyConfig(Checked):
     heads: int = field(default=4, metadata=COUNT)
     head_dim: int = field(default=64, metadata=COUNT)
     mlp_dim: int = field(default=1024, metadata=COUNT)
-    whiten: bool = field(default=False, metadata=was(False))
+    whiten: bool = field(default=False, metadata=was(False) | set_by("behaviour.whiten"))
     slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
-    gain: float = field(default=1.0, metadata=UNSAID | between(0, 1, "0 to 1"))
+    gain: float = field(default=1.0, metadata=UNSAID | between(0, 1, "0 to 1") | set_by("behaviour.gain"))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -226,9 +227,9 @@ class ActionDecoderConfig(Checked):
     state_layers: int = field(default=2, metadata=was(2) | LAYERS)
     state_heads: int = field(default=4, metadata=was(4) | at_least(1))
     state_dropout: float = field(default=0.5, metadata=was(0.5) | below_one("0 to below 1"))
-    whiten: bool = field(default=False, metadata=was(False))
-    reads_slots: bool = field(default=False, metadata=was(False))
-    slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
+    whiten: bool = field(default=False, metadata=was(False) | set_by("behaviour.whiten"))
+    reads_slots: bool = field(default=False, metadata=was(False) | set_by("behaviour.decoder_state"))
+    slots: tuple[int, ...] = field(default=(), metadata=CHOSEN | set_by("model.policy.slots"))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -149,16 +149,26 @@ def was(value: Any) -> dict[str, Any]:
     return {"was": value}
 
 
+def set_by(key: str) -> dict[str, Any]:
+    """Metadata of a field that another key sets, by its dotted name: it is stored with a model, and not typed."""
+    return {"set_by": key}
+
+
 @functools.cache
-def earlier(cls: type) -> dict[str, Any]:
-    """What checkpoints that do not name a key were trained with, by the dotted names of a config class's keys."""
+def declared(cls: type, what: str) -> dict[str, Any]:
+    """What the metadata of a config class's keys and groups say of something, by their dotted names."""
     hints, found = type_hints(cls), dict[str, Any]()
     for field in dataclasses.fields(cls):
-        if "was" in field.metadata:
-            found[field.name] = field.metadata["was"]
+        if what in field.metadata:
+            found[field.name] = field.metadata[what]
         elif dataclasses.is_dataclass(hints[field.name]):
-            found.update({f"{field.name}.{key}": value for key, value in earlier(hints[field.name]).items()})
+            found.update({f"{field.name}.{key}": said for key, said in declared(hints[field.name], what).items()})
     return found
+
+
+def earlier(cls: type) -> dict[str, Any]:
+    """What checkpoints that do not name a key were trained with, by the dotted names of a config class's keys."""
+    return declared(cls, "was")
 
 
 def naming(config: Any) -> dict[str, Any]:

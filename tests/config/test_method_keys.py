@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 
 import pytest
 
@@ -11,6 +12,7 @@ from playslot_rl.config.compose import compose, spelled
 from playslot_rl.config.method_keys import chosen
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.plain import flatten
+from playslot_rl.config.roles import declared
 from playslot_rl.errors import ConfigError
 
 LAPO_STEPS = "baselines.lapo.model.steps= or baselines.lapo.policy.steps="
@@ -137,3 +139,12 @@ def test_every_key_of_the_shared_groups_is_read_by_a_method() -> None:
     everything.append(chosen(typed("compare", "methods=playslot"), "compare"))
     keys = [key for key in VALUES if key.partition(".")[0] in ("model", "slots", "dynamics", "behaviour", "baselines")]
     assert not [key for key in keys if not any(methods is not None and methods.reads(key) for methods in everything)]
+
+
+@pytest.mark.parametrize("key, setter", declared(ExperimentConfig, "set_by").items())
+def test_what_another_key_sets_is_not_typed(key: str, setter: str) -> None:
+    value = {"model.policy.gain": 0.5, "model.action_decoder.slots": "[1]"}.get(key, "true")
+    with pytest.raises(ConfigError) as caught:
+        typed("train-policy", f"{key}={value}")
+    assert str(caught.value) == f"{key}: got {value}, expected none: {setter}= sets it"
+    attrgetter(setter)(compose())  # a key that there is
