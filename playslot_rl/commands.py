@@ -78,11 +78,12 @@ COMMANDS: Final[dict[str, Command]] = {
     "train-baseline": Command(
         "one of the methods PlaySlot is compared with, as a run of its own",
         "Trains method=slot_oracle, slot_bc, resnet_oracle, resnet_bc, history_bc, act, act_state, diffusion, "
-        "diffusion_state, autoencoder_bc, inverse_bc, lapo, lapo_slots, laom, clam, caddy_policy, caddy_oracle, "
-        "dreamer or sold into out=; `playslot evaluate run=OUT` then measures it as PlaySlot. Or one that predicts "
-        "videos, svg, caddy, slotformer or ocvp_seq; `playslot compare-video` scores it (docs/explanation/methods.md). "
-        "run= is the world model whose slots slot_oracle, slot_bc, lapo_slots, sold, slotformer and ocvp_seq build "
-        "on; settings come from env= and preset=, not from that run. demos=N takes the first N demonstrations.",
+        "diffusion_state, autoencoder_bc, inverse_bc, slot_vpt, lapo, lapo_slots, laom, clam, caddy_policy, "
+        "caddy_oracle, dreamer or sold into out=; `playslot evaluate run=OUT` then measures it as PlaySlot. Or one "
+        "that predicts videos, svg, caddy, slotformer or ocvp_seq; `playslot compare-video` scores it "
+        "(docs/explanation/methods.md). run= is the world model whose slots slot_oracle, slot_bc, slot_vpt, "
+        "lapo_slots, sold, slotformer and ocvp_seq build on; settings come from env= and preset=, not from that run. "
+        "demos=N takes the first N demonstrations.",
         (
             "playslot train-baseline method=slot_oracle run=pretrained data.demos=data/expert demos=50 out=runs/oracle",
             "playslot train-baseline method=lapo data.root=data/random data.demos=data/expert out=runs/lapo",

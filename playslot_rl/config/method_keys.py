@@ -53,7 +53,7 @@ class Chosen:
         if key in DEMOS:
             return any(stage.data in ("demos", "labelled") for stage in self.stages)
         if key == LABELS:
-            return any(method.decodes or method.labelled_only for method in self.methods)
+            return any(method.some_labelled or method.labelled_only for method in self.methods)
         if key == LABELLED and self.command == "compare" and self.config.compare.labels:
             return False
         if key.partition(".")[0] not in GROUPS or _within(key, self._own):

@@ -89,9 +89,14 @@ class Method:
         return self.last.data == "labelled"
 
     @property
-    def decodes(self) -> bool:
-        """Whether its policy clones latent actions and needs no label, which only its decoder reads."""
+    def some_labelled(self) -> bool:
+        """Whether it learns from all demonstrations, and from the real actions of some: `labels=`."""
         return bool({"behaviour", "behaviour.labelled_demos"} & {*self.last.settings})
+
+    @property
+    def one_policy(self) -> bool:
+        """Whether its policy clones latent actions and needs no label, so that one serves any number of them."""
+        return bool({"behaviour", "behaviour.policy_from"} & {*self.last.reads})
 
     @cached_property
     def world(self) -> tuple[str, ...]:
@@ -125,6 +130,7 @@ _OURS: Final[Mapping[str, str]] = {
     "diffusion_state": "lerobot_policy.method:DIFFUSION_STATE",
     "autoencoder_bc": "frozen_encoder.method:AUTOENCODER_BC",
     "inverse_bc": "frozen_encoder.method:INVERSE_BC",
+    "slot_vpt": "slot_vpt.method:SLOT_VPT",
     "lapo": "lapo.method:LAPO",
     "lapo_slots": "lapo.slots_method:LAPO_SLOTS",
     "laom": "laom.method:LAOM",

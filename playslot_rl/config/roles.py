@@ -176,7 +176,7 @@ def naming(config: Any) -> dict[str, Any]:
     what it `was`, so that jobs from before it could be are the same jobs.
     """
     flat = flatten(values := without(config, "machine"))
-    for key, value in earlier(type(config)).items():  # type: ignore[arg-type]
+    for key, value in earlier(type(config)).items():
         if flat.get(key, value) is None:
             put(values, key, value)
     return values

@@ -139,7 +139,7 @@ def _model(spec: StageSpec, record: StageRecord, run: Run) -> StageCheckpoint:
 
     What the method will clone is looked at before a model is trained for it.
     """
-    config, labelled = record.config, record.spec.data == "demos" and METHODS[record.config.method].decodes
+    config, labelled = record.config, record.spec.data == "demos" and METHODS[record.config.method].some_labelled
     count = config.behaviour.labelled_demos if labelled else None
     record.data.require_actions(config.env.action_dim)
     if count is not None:

@@ -32,6 +32,7 @@ TABLE = {  # of each method: a key that it reads, others that it does not, and w
     "diffusion_state": ("baselines.diffusion.steps", {LABELS: "demos", "behaviour.loss": NONE}),
     "autoencoder_bc": ("model.policy.dim", {LABELS: "demos", "baselines.lapo.hidden": NONE}),
     "inverse_bc": ("baselines.inverse_bc.hidden", {LABELS: "demos", "behaviour.decoder_lr": NONE}),
+    "slot_vpt": ("behaviour.decoder_steps", {"behaviour.finetune_steps": NONE, "dynamics.steps": "behaviour.steps"}),
     "lapo": ("behaviour.policy_from", {"behaviour.steps": LAPO_STEPS, "behaviour.loss": "baselines.lapo.loss"}),
     "lapo_slots": ("behaviour.validate_every", {"behaviour.imagined": NONE, "baselines.lapo.hidden": NONE}),
     "laom": (LABELS, {"behaviour.loss": "baselines.laom.loss", "model.policy.dim": NONE}),

@@ -15,7 +15,7 @@ OUT = Path("/comparison")
 PARENTS = {"slots": "a", "dynamics": "b", "demos": "c", "videos": "d"}
 ACTING = (
     "playslot,slot_oracle,resnet_oracle,slot_bc,resnet_bc,history_bc,act,act_state,diffusion,diffusion_state,autoencoder_bc,inverse_bc,"
-    "lapo,lapo_slots,laom,clam,"
+    "slot_vpt,lapo,lapo_slots,laom,clam,"
     "dreamer,sold,caddy_policy,caddy_oracle"
 )
 UNLABELLED = ACTING.replace(

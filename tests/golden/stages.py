@@ -31,7 +31,7 @@ from playslot_rl.training.record import StageRecord
 BASELINES = (
     "slot_oracle", "resnet_oracle", "lapo", "lapo_slots", "laom", "clam", "dreamer", "sold", "caddy_policy",
     "caddy_oracle", "svg", "caddy", "slotformer", "ocvp_seq", "act", "diffusion", "autoencoder_bc",
-    "inverse_bc", "history_bc", "act_state", "diffusion_state",
+    "inverse_bc", "history_bc", "act_state", "diffusion_state", "slot_vpt",
 )  # fmt: skip
 ON_A_MODEL = {
     "lapo": "lapo_model",

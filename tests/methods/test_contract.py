@@ -40,6 +40,7 @@ RATES = {
     "dynamics": "dynamics.optim.lr",
     "policy": "behaviour.optim.lr",
     "slot_oracle": "behaviour.optim.lr",
+    "slot_vpt": "behaviour.decoder_lr",
     "lapo_model": "baselines.lapo.model.optim.lr",
     "autoencoder": "baselines.autoencoder_bc.model.optim.lr",
     "autoencoder_bc": "baselines.autoencoder_bc.policy.optim.lr",

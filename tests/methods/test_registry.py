@@ -64,8 +64,17 @@ def test_traits_follow_from_stages() -> None:
         return {name for name, method in METHODS.items() if getattr(method, trait)}
 
     assert named("online") == {"dreamer", "sold"}
-    assert named("slots") == {"playslot", "lapo_slots", "slot_oracle", "slot_bc", "sold", "slotformer", "ocvp_seq"}
-    assert named("decodes") == {"playslot", "lapo", "lapo_slots", "laom", "clam", "caddy_policy"}
+    assert named("slots") == {
+        "playslot",
+        "slot_vpt",
+        "lapo_slots",
+        "slot_oracle",
+        "slot_bc",
+        "sold",
+        "slotformer",
+        "ocvp_seq",
+    }
+    assert named("some_labelled") == {"slot_vpt", "playslot", "lapo", "lapo_slots", "laom", "clam", "caddy_policy"}
     assert named("labelled_only") == {
         "slot_bc", "resnet_bc", "history_bc", "act", "act_state", "diffusion", "diffusion_state", "autoencoder_bc",
         "inverse_bc",

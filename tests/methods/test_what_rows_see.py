@@ -64,6 +64,7 @@ TABLE = {
     "diffusion_state": Sees(False, "all", "frames", frames=2, proprioception=True),
     "autoencoder_bc": Sees(True, "all", "frames"),
     "inverse_bc": Sees(True, "all", "frames"),
+    "slot_vpt": Sees(True, "some", "slots"),
     "lapo": Sees(True, "some", "frames", state=True),
     "laom": Sees(True, "some", "frames", state=True),
     "clam": Sees(True, "some", "frames"),
@@ -86,7 +87,7 @@ def test_videos_are_seen_where_a_model_of_them_is_built_on(name: str) -> None:
     assert TABLE[name].videos == (method.slots or method.model is not None)
 
 
-DECODES = [name for name in TABLE if METHODS[name].decodes and hasattr(METHODS[name].config, "decoder_steps")]
+DECODERS = [name for name in TABLE if METHODS[name].some_labelled and hasattr(METHODS[name].config, "decoder_steps")]
 
 
 @pytest.mark.parametrize("preset", ["compact", "gpu", "paper"])
@@ -94,7 +95,7 @@ DECODES = [name for name in TABLE if METHODS[name].decodes and hasattr(METHODS[n
 def test_policy_and_decoder_see_as_many_samples_as_playslots(env: str, preset: str) -> None:
     config = compose([f"env={env}", f"preset={preset}"])
     own = config.behaviour
-    for name in DECODES:
+    for name in DECODERS:
         rival = getattr(config.baselines, name)
         assert rival.policy.steps * rival.policy.batch_size >= own.steps * own.batch_size, name
         if not hasattr(rival, "decoder_steps"):

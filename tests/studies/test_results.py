@@ -144,7 +144,8 @@ def test_the_result_is_json(ended: dict[str, Any]) -> None:
 def test_every_method_has_a_marker_of_its_own_and_kin_have_one_colour() -> None:
     styles = {name: method.style for name, method in METHODS.items() if method.acts}
     assert len({style.marker for style in styles.values()}) == len(styles)
-    kin = {"slot_bc": "slot_oracle", "resnet_bc": "resnet_oracle", "laom": "lapo", "clam": "lapo"}
+    kin = {"slot_bc": "slot_oracle", "slot_vpt": "slot_oracle", "resnet_bc": "resnet_oracle"}
+    kin |= {"laom": "lapo", "clam": "lapo"}
     assert [styles[name].colour for name in kin] == [styles[name].colour for name in kin.values()]
     assert {style.colour for style in styles.values()} == set(range(len(LIGHT.series))), "each before one is used again"
 

@@ -113,11 +113,12 @@ def _builds_on_model(config: ExperimentConfig, method: str) -> bool:
 
 
 def _of_demonstrations(job: SuccessJob, labels: Sequence[int], config: ExperimentConfig) -> list[SuccessJob]:
-    """The job, or one for each number of labels: the first one's policy serves them all, unless its latents are
-    supervised by the labels."""
-    if not labels or not METHODS[job.method].decodes:
+    """The job, or one for each number of labels: the first one's policy serves them all, unless labels count in it, or
+    in its latents."""
+    if not labels or not METHODS[job.method].some_labelled:
         return [job]
-    own = {labels[0], *(labels if _supervised(config, job.method) else ())}
+    served = METHODS[job.method].one_policy and not _supervised(config, job.method)
+    own = {labels[0], *(() if served else labels)}
     return [replace(job, labels=n, policy_of=None if n in own else labels[0]) for n in labels]
 
 

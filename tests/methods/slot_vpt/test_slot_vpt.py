@@ -1,0 +1,55 @@
+"""VPT on slots: what stands in for labels, and what it is told from."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from playslot_rl.config import PolicyConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.methods.slot_vpt.training import Moves, labeller_stage, pseudo_labels
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.seeds.draws import StepGenerators
+
+SIZES = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16)
+
+
+@pytest.fixture
+def labeller() -> LatentPolicy:
+    torch.manual_seed(0)
+    return LatentPolicy(SIZES, 2 * 6, 3)
+
+
+@pytest.fixture
+def seen() -> Moves:
+    """Two transitions of each of four demonstrations, five slots."""
+    generator = torch.Generator().manual_seed(1)
+    pairs = torch.randn(8, 5, 12, generator=generator)
+    return Moves(pairs, torch.rand(8, 3, generator=generator) * 2 - 1, torch.arange(4).repeat_interleave(2), None)
+
+
+def test_real_actions_stay_where_they_are_labelled_and_no_others_are_read(labeller: LatentPolicy, seen: Moves) -> None:
+    said = pseudo_labels(labeller, seen, 2)
+    assert torch.equal(said[:4], seen.actions[:4])
+    unknown = seen._replace(actions=torch.where((seen.episode < 2)[:, None], seen.actions, torch.nan))
+    assert torch.equal(pseudo_labels(labeller, unknown, 2), said)
+
+
+def test_what_stands_in_is_an_action(labeller: LatentPolicy, seen: Moves) -> None:
+    labeller.head.bias.data.fill_(9.0)
+    assert torch.equal(pseudo_labels(labeller, seen, 2)[4:], torch.ones(4, 3))
+
+
+def test_the_labeller_tells_what_came_first_and_not_the_order_of_slots(labeller: LatentPolicy, seen: Moves) -> None:
+    said, (before, after) = labeller(seen.pairs), seen.pairs.chunk(2, dim=-1)
+    torch.testing.assert_close(labeller(seen.pairs[:, [3, 0, 4, 1, 2]]), said)
+    assert not torch.allclose(labeller(torch.cat((after, before), dim=-1)), said)
+    assert torch.equal(seen.slots, before)
+
+
+def test_the_labeller_learns_from_the_labelled_demonstrations_alone(labeller: LatentPolicy, seen: Moves) -> None:
+    config = compose(["behaviour.labelled_demos=1", "behaviour.slot_noise=0", "behaviour.batch_size=32"])
+    stage = labeller_stage(labeller, seen, config, None)
+    batch = stage.batch(0, StepGenerators(0, 0))
+    rows = {tuple(row.tolist()) for row in seen.actions[:2]}
+    assert {tuple(row.tolist()) for part in batch.values() for row in part if row.shape == (3,)} == rows
