@@ -184,7 +184,7 @@ def test_success_is_told_by_task() -> None:
 @pytest.mark.integration
 @pytest.mark.slow
 def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
-    run, demos, bc = (tmp_path / name for name in ("run", "demos", "bc"))
+    run, demos = tmp_path / "run", tmp_path / "demos"
     smoke("collect", *MADE, "policy=expert", "episodes=11", f"out={demos}")
     smoke("train-slots", *MADE, f"data.root={demos}", f"out={run}")
     smoke("train-dynamics", f"run={run}")
@@ -201,8 +201,10 @@ def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
     smoke("collect", *instead(MADE, "env.task=push"), "policy=expert", "episodes=6", f"out={pushes}")
     smoke("train-policy", f"run={run}", f"out={one}", "env.task=push", f"data.demos={pushes}")
     assert "push:" not in smoke("evaluate", f"run={one}", "episodes=2", "evaluation.references=false").out
-    smoke("train-baseline", "preset=smoke", "method=slot_bc", f"run={run}", f"data.demos={demos}", *MADE, f"out={bc}")
-    assert "push:" in smoke("evaluate", f"run={bc}", "episodes=2", "evaluation.references=false").out
+    for method in ("slot_bc", "slot_vpt"):
+        out, typed = tmp_path / method, ("preset=smoke", f"method={method}", f"run={run}", f"data.demos={demos}", *MADE)
+        smoke("train-baseline", *typed, f"out={out}")
+        assert "push:" in smoke("evaluate", f"run={out}", "episodes=2", "evaluation.references=false").out
 
 
 def test_methods_that_are_told_nothing_are_refused(tmp_path: Path) -> None:
