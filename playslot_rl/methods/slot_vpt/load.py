@@ -18,7 +18,7 @@ TWO: Final = ("labeller", "oracle")
 
 
 def networks(sizes: PolicyConfig, slot_dim: int, env: EnvConfig) -> tuple[LatentPolicy, LatentPolicy]:
-    """Labeller, of the slots of two frames beside each other, and policy, untrained."""
+    """Labeller, of slots and their change beside each other, and policy, untrained."""
     width = env.action_dim
     policy = LatentPolicy(sizes, slot_dim, width, acts=True, tasks=len(env.tasks))
     return LatentPolicy(sizes, 2 * slot_dim, width), policy

@@ -24,8 +24,9 @@ def labeller() -> LatentPolicy:
 def seen() -> Moves:
     """Two transitions of each of four demonstrations, five slots."""
     generator = torch.Generator().manual_seed(1)
-    pairs = torch.randn(8, 5, 12, generator=generator)
-    return Moves(pairs, torch.rand(8, 3, generator=generator) * 2 - 1, torch.arange(4).repeat_interleave(2), None)
+    slots, change = torch.randn(2, 8, 5, 6, generator=generator)
+    actions = torch.rand(8, 3, generator=generator) * 2 - 1
+    return Moves(slots, change, actions, torch.arange(4).repeat_interleave(2), None)
 
 
 def test_real_actions_stay_where_they_are_labelled_and_no_others_are_read(labeller: LatentPolicy, seen: Moves) -> None:
@@ -40,11 +41,18 @@ def test_what_stands_in_is_an_action(labeller: LatentPolicy, seen: Moves) -> Non
     assert torch.equal(pseudo_labels(labeller, seen, 2)[4:], torch.ones(4, 3))
 
 
-def test_the_labeller_tells_what_came_first_and_not_the_order_of_slots(labeller: LatentPolicy, seen: Moves) -> None:
-    said, (before, after) = labeller(seen.pairs), seen.pairs.chunk(2, dim=-1)
-    torch.testing.assert_close(labeller(seen.pairs[:, [3, 0, 4, 1, 2]]), said)
-    assert not torch.allclose(labeller(torch.cat((after, before), dim=-1)), said)
-    assert torch.equal(seen.slots, before)
+def test_the_labeller_tells_one_change_from_its_opposite_and_knows_no_order_of_slots(
+    labeller: LatentPolicy, seen: Moves
+) -> None:
+    one = torch.ones(())
+    said = labeller(seen.pairs(one))
+    torch.testing.assert_close(labeller(seen.pairs(one)[:, [3, 0, 4, 1, 2]]), said)
+    assert not torch.allclose(labeller(seen._replace(change=-seen.change).pairs(one)), said)
+
+
+def test_changes_count_by_how_much_they_vary(labeller: LatentPolicy, seen: Moves) -> None:
+    small = seen._replace(change=seen.change / 100)
+    torch.testing.assert_close(pseudo_labels(labeller, small, 2), pseudo_labels(labeller, seen, 2))
 
 
 def test_the_labeller_learns_from_the_labelled_demonstrations_alone(labeller: LatentPolicy, seen: Moves) -> None:
