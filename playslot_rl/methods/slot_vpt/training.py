@@ -12,7 +12,7 @@ policy's network on a slot and its change beside each other, trained as PlaySlot
 
 Note: the paper's inverse model reads 128 frames and learns from 2,000 hours of labels. Of S_{t+1} in place of c_t a few
 labels teach much less (on easy BlockPush five leave 0.40 of the held-out variance unexplained, not 0.17): a step
-changes slots by a tenth of their spread.
+changes slots by an eighth of their spread.
 
 Shapes: M transitions, N slots, D slot width, A action width.
 """
