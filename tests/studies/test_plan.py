@@ -258,3 +258,16 @@ def test_jobs_of_another_draw_are_other_jobs(
 def test_equal_draws_by_other_keys_are_one_job(monkeypatch: pytest.MonkeyPatch) -> None:
     two = [built_on(160, (f"{key}=30",), monkeypatch) for key in ("data.held_out", "collect.validation_episodes")]
     assert two[0] == two[1]
+
+
+def test_demonstrations_of_several_sets_are_counted_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = {"a": 3, "b": 4}
+    monkeypatch.setattr(jobs, "open_files", lambda root: SimpleNamespace(episodes=range(held[root])))
+    monkeypatch.setattr(jobs, "open_videos", lambda *_: demonstrations(7))
+    monkeypatch.setattr(EpisodeFrames, "require_actions", lambda *_: None)
+    config = compared("methods=playslot", "data.demos=a,b", "demos=7", "data.held_out=0")
+    jobs.check_data(config)
+    with pytest.raises(ConfigError, match=r"demos: got 8, expected at most the 7 demonstrations of data\.demos=a,b"):
+        jobs.check_data(replace(config, compare=replace(config.compare, demos=(8,))))
+    job = SuccessJob("playslot", 5, 0, OUT)
+    assert success_config(config, job, "").data.demos == absolute_roots("a,b") != "a,b"

@@ -180,7 +180,7 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
         own = {job.method: replace(getattr(config.baselines, job.method), world=world_of)}
     draw = None if job.online else job.seed
     return replace(
-        job_config(config, job, job.method, world, demos=absolute(config.data.demos), draw=draw),
+        job_config(config, job, job.method, world, demos=absolute_roots(config.data.demos), draw=draw),
         demos=job.demos,
         protocol="simulation",
         behaviour=replace(config.behaviour, labelled_demos=labelled, oracle=False, policy_from=policy),
@@ -239,7 +239,7 @@ def _recorded_elsewhere(config: ExperimentConfig) -> ExperimentConfig:
     out for all, and as many demonstrations are used as are left where the numbers are the default ones. A DataError
     where a world model that is named was shown what is held out."""
     config = of_recorded(config)
-    demos, own = absolute(config.data.demos or config.data.root), config.compare
+    demos, own = absolute_roots(config.data.demos or config.data.root), config.compare
     count = _episodes(demos)
     held = config.data.held_out or count - drawn_among(count, 0, config.collect.validation_episodes)
     collect = replace(config.collect, validation_episodes=held)  # these alone measure
@@ -317,8 +317,8 @@ def _recorded(out: Path) -> bool:
     return (out / EXPERT / "meta" / "info.json").is_file()
 
 
-def _episodes(root: str | Path) -> int:
-    return len(open_files(root).episodes)
+def _episodes(roots: str | Path) -> int:
+    return sum(len(open_files(root.path).episodes) for root in data_roots(str(roots)))
 
 
 def _demos(config: ExperimentConfig, out: Path) -> DataConfig:
