@@ -75,6 +75,7 @@ def test_traits_follow_from_stages() -> None:
         "ocvp_seq",
     }
     assert named("some_labelled") == {"slot_vpt", "playslot", "lapo", "lapo_slots", "laom", "clam", "caddy_policy"}
+    assert named("one_policy") == named("some_labelled") - {"slot_vpt", "clam"}
     assert named("labelled_only") == {
         "slot_bc", "resnet_bc", "history_bc", "act", "act_state", "diffusion", "diffusion_state", "autoencoder_bc",
         "inverse_bc",

@@ -42,6 +42,11 @@ def test_the_policy_is_trained_once_for_all_numbers_of_labels(method: str) -> No
     assert success_config(config, second, "pretrained").behaviour.policy_from == str(first.run.resolve())
 
 
+def test_a_policy_that_labels_count_in_is_trained_for_each() -> None:
+    jobs = success_jobs(compared("methods=slot_vpt,laom", "demos=100", "labels=5,25", "seeds=0"), OUT)
+    assert [(job.labels, job.policy_of) for job in jobs] == [(5, None), (25, None)] * 2
+
+
 @pytest.mark.parametrize(
     ("method", "demos", "labels", "expected"),
     [("playslot", 100, 5, (100, 5)), ("lapo", 100, 25, (100, 25)), ("caddy_policy", 100, 25, (100, 25)),

@@ -29,6 +29,7 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.demonstrations import (
+    FRAMES_AT_ONCE,
     labelled_rows,
     moving_slots,
     real_actions,
@@ -47,7 +48,7 @@ from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_behaviour import VALIDATED, oracle_stage
-from playslot_rl.training.stage_regression import RegressionStage, TensorInputs, apply_rows
+from playslot_rl.training.stage_regression import RegressionStage, TensorInputs
 
 
 class Moves(NamedTuple):
@@ -65,9 +66,9 @@ class Moves(NamedTuple):
         """k."""
         return self.slots.std() / self.change.std()
 
-    def pairs(self, gain: Tensor) -> Tensor:
-        """What the labeller reads (M, N, 2 D)."""
-        return torch.cat((self.slots, gain * self.change), dim=-1)
+    def pairs(self, gain: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        """What the labeller reads (M', N, 2 D) of some transitions."""
+        return torch.cat((self.slots[rows], gain * self.change[rows]), dim=-1)
 
 
 def moves(views: list[ParsedVideos], config: ExperimentConfig, device: torch.device) -> Moves:
@@ -97,7 +98,7 @@ def labeller_stage(
     return RegressionStage(
         "labeller",
         criterion,
-        TensorInputs(seen.pairs(gain)[rows], own.slot_noise, "labeller_noise"),
+        TensorInputs(seen.pairs(gain, rows), own.slot_noise, "labeller_noise"),
         seen.actions[rows],
         own.batch_size,
         held_out=other and (TensorInputs(other.pairs(gain)), other.actions),
@@ -106,10 +107,12 @@ def labeller_stage(
     )
 
 
+@torch.no_grad()
 def pseudo_labels(labeller: LatentPolicy, seen: Moves, labelled: int) -> Tensor:
     """Actions (M, A) that stand in for the real ones; where these are labelled, they themselves."""
-    pairs, every = seen.pairs(seen.gain()), torch.arange(len(seen.slots), device=seen.slots.device)
-    said = apply_rows(labeller.eval(), TensorInputs(pairs), every).clamp(-1, 1)
+    labeller.eval()
+    gain, every = seen.gain(), torch.arange(len(seen.slots), device=seen.slots.device)
+    said = torch.cat([labeller(seen.pairs(gain, rows)) for rows in every.split(FRAMES_AT_ONCE)]).clamp(-1, 1)
     return torch.where((seen.episode < labelled)[:, None], seen.actions, said)
 
 
