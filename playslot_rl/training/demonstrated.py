@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.data.cache import Cache
-from playslot_rl.data.demonstrations import DemonstrationSplit
+from playslot_rl.data.demonstrations import (
+    DemonstrationSplit,
+    Transitions,
+    moving_slots,
+    real_actions,
+    told_tasks,
+    transitions,
+)
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import shifted_copies
@@ -44,6 +53,32 @@ def demonstration_views(
     shifted_views = [(copy, parse(of)) for copy, of in zip(copies(demos.trained), copies(demos.parsed), strict=True)]
     held_out = [] if demos.held_out is None else [(demos.held_out, parse(demos.held_out))]
     return [(demos.trained, parse(demos.parsed)), *shifted_views], held_out
+
+
+class Moves(NamedTuple):
+    """Transitions of demonstrations in which slots move: their slots (M, N, D), real actions (M, A), and task int64
+    (M, 1) where there are several; and where they are among the frames of each view.
+    """
+
+    slots: Tensor
+    actions: Tensor
+    task: Tensor | None
+    found: list[Transitions]
+
+
+def moves(views: list[ParsedVideos], config: ExperimentConfig, device: torch.device) -> Moves:
+    """What a policy that clones real actions learns from: trimmed by `behaviour.trim`."""
+    own, env = config.behaviour, config.env
+    found = [moving_slots(transitions(frames), slots, own.trim, own.trim_margin) for frames, slots in views]
+    pairs = list(zip(views, found, strict=True))
+    told = [told_tasks(frames, moving, env) for (frames, _), moving in pairs]
+    task = [each for each in told if each is not None]
+    return Moves(
+        torch.cat([torch.from_numpy(slots[moving.rows]) for (_, slots), moving in pairs]).to(device),
+        torch.cat([real_actions(frames, moving.rows, env.action_dim) for (frames, _), moving in pairs]).to(device),
+        torch.cat(task).to(device) if task else None,
+        found,
+    )
 
 
 def policy_taken_over(config: ExperimentConfig, record: StageRecord, steps: int) -> Path | None:

@@ -376,16 +376,17 @@ def oracle_stage(
     config: BehaviourStageConfig,
     held_out: tuple[Tensor, Tensor, Tensor | None] | None = None,
     task: Tensor | None = None,
+    name: str = "oracle",
 ) -> RegressionStage:
     """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations, and which task
-    (M, 1) they are of where there are several; the held-out ones only measure.
+    (M, 1) they are of where there are several; the held-out ones only measure. `name` is of its losses and its noise.
     """
     criterion = BehaviourLoss(oracle, config.loss)
     criterion.set_keys(action=keys.ACTION)
     return RegressionStage(
-        "oracle",
+        name,
         criterion,
-        PairedInputs.told(TensorInputs(slots, config.slot_noise, "oracle_noise"), task),
+        PairedInputs.told(TensorInputs(slots, config.slot_noise, f"{name}_noise"), task),
         actions,
         config.batch_size,
         held_out=held_out and (PairedInputs.told(TensorInputs(held_out[0]), held_out[2]), held_out[1]),

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
-
-from playslot_rl.data.demonstrations import moving_slots, real_actions, require_finite, told_tasks, transitions
+from playslot_rl.data.demonstrations import require_finite
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.demonstrated import ParsedVideos, cloning_alone, demonstration_views
+from playslot_rl.training.demonstrated import cloning_alone, demonstration_views, moves
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
@@ -24,21 +21,9 @@ def training(record: StageRecord) -> Training:
     with global_seed(config.seed, 0, record.name):
         sizes, tasks = savi.config.slot_dim, len(config.env.tasks)
         oracle = LatentPolicy(config.model.policy, sizes, width, acts=True, tasks=tasks).to(device)
-
-    behaviour = config.behaviour
-
-    def examples(views: list[ParsedVideos]) -> tuple[Tensor, Tensor, Tensor | None]:
-        trim, margin = behaviour.trim, behaviour.trim_margin
-        moves = [moving_slots(transitions(frames), cached, trim, margin) for frames, cached in views]
-        rows = [moving.rows for moving in moves]
-        told = [told_tasks(frames, moving, config.env) for (frames, _), moving in zip(views, moves, strict=True)]
-        task = torch.cat([each.to(device) for each in told if each is not None]) if config.env.tasks else None
-        slots = [torch.from_numpy(cached[at]) for (_, cached), at in zip(views, rows, strict=True)]
-        actions = [real_actions(frames, at, width) for (frames, _), at in zip(views, rows, strict=True)]
-        return torch.cat(slots).to(device), torch.cat(actions).to(device), task
-
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
-    slots, actions, task = examples(views)
-    stage = oracle_stage(oracle, slots, actions, behaviour, examples(others) if others else None, task)
+    seen, other = moves(views, config, device), moves(others, config, device) if others else None
+    measured = other and (other.slots, other.actions, other.task)
+    stage = oracle_stage(oracle, seen.slots, seen.actions, config.behaviour, measured, seen.task)
     part = Part(record.name, stage, config.behaviour, group="behaviour")
-    return cloning_alone(record, part, len(slots), views=len(views))
+    return cloning_alone(record, part, len(seen.slots), views=len(views))

@@ -26,32 +26,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from playslot_rl import keys
-from playslot_rl.config import ExperimentConfig
-from playslot_rl.data.demonstrations import (
-    FRAMES_AT_ONCE,
-    labelled_rows,
-    moving_slots,
-    real_actions,
-    require_finite,
-    require_labelled,
-    told_tasks,
-    transitions,
-)
-from playslot_rl.losses.behaviour import BehaviourLoss
+from playslot_rl.config import BehaviourStageConfig, ExperimentConfig
+from playslot_rl.data.demonstrations import FRAMES_AT_ONCE, labelled_rows, require_finite, require_labelled
 from playslot_rl.methods.slot_vpt.load import networks
 from playslot_rl.methods.slot_vpt.method import NAME
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.demonstrated import ParsedVideos, cloned, demonstration_views
+from playslot_rl.training.demonstrated import ParsedVideos, cloned, demonstration_views, moves
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
-from playslot_rl.training.stage_behaviour import VALIDATED, oracle_stage
-from playslot_rl.training.stage_regression import RegressionStage, TensorInputs
+from playslot_rl.training.stage_behaviour import oracle_stage
+from playslot_rl.training.stage_regression import RegressionStage
 
 
-class Moves(NamedTuple):
+class Changes(NamedTuple):
     """Transitions: slots before (M, N, D) and their change to those after, real actions (M, A), the demonstration of
     each int64 (M,), and its task (M, 1) where there are several.
     """
@@ -62,57 +51,38 @@ class Moves(NamedTuple):
     episode: Tensor
     task: Tensor | None
 
-    def gain(self) -> Tensor:
-        """k."""
-        return self.slots.std() / self.change.std()
+    @classmethod
+    def of(cls, views: list[ParsedVideos], config: ExperimentConfig, device: torch.device) -> Changes:
+        """Those of demonstrations in which slots move."""
+        seen = moves(views, config, device)
+        after = [torch.from_numpy(slots[at.rows + 1]) for (_, slots), at in zip(views, seen.found, strict=True)]
+        episode = torch.cat([torch.from_numpy(at.episode) for at in seen.found]).to(device)
+        return cls(seen.slots, torch.cat(after).to(device) - seen.slots, seen.actions, episode, seen.task)
 
-    def pairs(self, gain: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+    def scale(self) -> Tensor:
+        """k, which is finite where nothing moves, too."""
+        return self.slots.std() / self.change.std().clamp_min(torch.finfo(self.change.dtype).eps)
+
+    def pairs(self, scale: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
         """What the labeller reads (M', N, 2 D) of some transitions."""
-        return torch.cat((self.slots[rows], gain * self.change[rows]), dim=-1)
-
-
-def moves(views: list[ParsedVideos], config: ExperimentConfig, device: torch.device) -> Moves:
-    """The transitions of demonstrations in which slots move."""
-    own, width = config.behaviour, config.env.action_dim
-    before, after, actions, episode, task = (list[Tensor]() for _ in range(5))
-    for frames, slots in views:
-        moving = moving_slots(transitions(frames), slots, own.trim, own.trim_margin)
-        before.append(torch.from_numpy(slots[moving.rows]))
-        after.append(torch.from_numpy(slots[moving.rows + 1]))
-        actions.append(real_actions(frames, moving.rows, width))
-        episode.append(torch.from_numpy(moving.episode))
-        told = told_tasks(frames, moving, config.env)
-        task += [] if told is None else [told]
-    seen, then, acted, of = (torch.cat(part).to(device) for part in (before, after, actions, episode))
-    return Moves(seen, then - seen, acted, of, torch.cat(task).to(device) if task else None)
+        return torch.cat((self.slots[rows], scale * self.change[rows]), dim=-1)
 
 
 def labeller_stage(
-    labeller: LatentPolicy, seen: Moves, config: ExperimentConfig, other: Moves | None
+    labeller: LatentPolicy, seen: Changes, scale: Tensor, own: BehaviourStageConfig, other: Changes | None
 ) -> RegressionStage:
     """Real actions of the labelled demonstrations from their slots; those of held-out ones only measure."""
-    own, gain = config.behaviour, seen.gain()
     rows = labelled_rows(seen.episode, own.labelled_demos)
-    criterion = BehaviourLoss(labeller, own.loss)
-    criterion.set_keys(action=keys.ACTION)
-    return RegressionStage(
-        "labeller",
-        criterion,
-        TensorInputs(seen.pairs(gain, rows), own.slot_noise, "labeller_noise"),
-        seen.actions[rows],
-        own.batch_size,
-        held_out=other and (TensorInputs(other.pairs(gain)), other.actions),
-        validated=VALIDATED,
-        precision=own.precision,
-    )
+    measured = other and (other.pairs(scale), other.actions, None)
+    return oracle_stage(labeller, seen.pairs(scale, rows), seen.actions[rows], own, measured, name="labeller")
 
 
 @torch.no_grad()
-def pseudo_labels(labeller: LatentPolicy, seen: Moves, labelled: int) -> Tensor:
+def pseudo_labels(labeller: LatentPolicy, seen: Changes, scale: Tensor, labelled: int) -> Tensor:
     """Actions (M, A) that stand in for the real ones; where these are labelled, they themselves."""
     labeller.eval()
-    gain, every = seen.gain(), torch.arange(len(seen.slots), device=seen.slots.device)
-    said = torch.cat([labeller(seen.pairs(gain, rows)) for rows in every.split(FRAMES_AT_ONCE)]).clamp(-1, 1)
+    every = torch.arange(len(seen.slots), device=seen.slots.device)
+    said = torch.cat([labeller(seen.pairs(scale, rows)) for rows in every.split(FRAMES_AT_ONCE)]).clamp(-1, 1)
     return torch.where((seen.episode < labelled)[:, None], seen.actions, said)
 
 
@@ -128,14 +98,15 @@ def training(record: StageRecord) -> Training:
         labeller, policy = networks(config.model.policy, savi.config.slot_dim, config.env)
         labeller, policy = labeller.to(device), policy.to(device)
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
-    seen, other = moves(views, config, device), moves(others, config, device) if others else None
+    seen, other = Changes.of(views, config, device), Changes.of(others, config, device) if others else None
+    scale = seen.scale()
 
     def parts() -> Iterator[Part]:
         schedule = replace(own, steps=own.decoder_steps, optim=replace(own.optim, lr=own.decoder_lr))
         renamed = {"steps": "behaviour.decoder_steps", "optim.lr": "behaviour.decoder_lr"}
-        stage, labelled = labeller_stage(labeller, seen, config, other), {"labelled_demos": own.labelled_demos}
+        stage, labelled = labeller_stage(labeller, seen, scale, own, other), {"labelled_demos": own.labelled_demos}
         yield Part(f"{NAME}.labeller", stage, schedule, group="behaviour", renamed=renamed, identity=labelled)
-        actions = pseudo_labels(labeller, seen, own.labelled_demos)
+        actions = pseudo_labels(labeller, seen, scale, own.labelled_demos)
         measured = other and (other.slots, other.actions, other.task)
         cloning = oracle_stage(policy, seen.slots, actions, own, measured, seen.task)
         yield Part(f"{NAME}.policy", cloning, own, "policy", "behaviour", identity=labelled)
