@@ -45,7 +45,8 @@ class DataConfig(Checked):
         root: LeRobot v3.0 data set(s) of unlabelled videos, separated by commas. With `stream` also
             `hf://datasets/USER/NAME[@REVISION]`, read where it lies (`playslot_rl.data.remote`).
         demos: data set of demonstrations; empty means `root`.
-        held_out: how many of its last episodes are neither trained on nor shown to the world model: they measure.
+        held_out: how many last episodes, of each task in proportion, are neither trained on nor shown to the world
+            model: they measure.
         draw: seed that draws which of the other demonstrations are the first ones; None takes them as recorded.
         camera: image feature(s) to read, separated by commas; empty means the only one.
         stride: of each episode every `stride`-th frame is read (`playslot_rl.data.views.every`); policies act at that

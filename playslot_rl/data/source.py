@@ -75,6 +75,7 @@ class EpisodeFrames:
         origins: of each episode a hash of its actions, or where they say nothing of its pictures, str (E,): the same in
             any set that it is copied to, and however it is viewed (`playslot_rl.data.prints`); None where it is not
             known.
+        turns: whether its tasks take turns (`playslot_rl.data.turns`), in what is drawn from it, too.
     """
 
     frames: FrameRows
@@ -95,6 +96,7 @@ class EpisodeFrames:
     recorded: npt.NDArray[np.int64] | None = None
     unlabelled: str = ""
     origins: npt.NDArray[np.str_] | None = None
+    turns: bool = False
 
     @property
     def episodes(self) -> int:

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from playslot_rl.data.action_limits import joined_limits
 from playslot_rl.data.agreement import say_once
+from playslot_rl.data.turns import turns
 from playslot_rl.errors import DataError
 
 if TYPE_CHECKING:
@@ -157,6 +158,24 @@ def chosen_episodes(source: EpisodeFrames, numbers: IntArray, how: str) -> Episo
     known = {name: getattr(source, name) for name in ("starts", "lengths", "seeds", "tasks", "origins")}
     chosen = {name: None if values is None else values[episodes] for name, values in known.items()}
     return _viewed(source, how, **chosen, recorded=recorded)
+
+
+def by_turns(source: EpisodeFrames) -> EpisodeFrames:
+    """The same episodes, whose tasks take turns from now on."""
+    if not (tasks := recorded_tasks(source)) or source.shares is not None:  # who clones refuses weights
+        return source
+    order, taking = turns(tasks), replace(source, turns=True)
+    if (np.diff(order) > 0).all():
+        return taking
+    chosen = chosen_episodes(taking, order, "by turns")
+    rows = np.concatenate([chosen.episode_rows(episode) for episode in range(chosen.episodes)])
+    return replace(_counted_anew(source, chosen, rows), starts=np.cumsum(chosen.lengths) - chosen.lengths)
+
+
+def recorded_tasks(source: EpisodeFrames) -> list[str]:
+    """What is to be done in each recorded episode (R); empty where it was not read."""
+    first = np.unique(source.numbers, return_index=True)[1]
+    return [] if source.tasks is None else [str(task) for task in source.tasks[first]]
 
 
 def views_of_one(views: Sequence[EpisodeFrames]) -> EpisodeFrames:
@@ -311,8 +330,13 @@ def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames
     rows = np.arange(chosen.starts[0], chosen.starts[-1] + chosen.lengths[-1])
     if source.recorded is not None:  # what lies between is of other episodes
         rows = np.concatenate([chosen.episode_rows(episode) for episode in range(chosen.episodes)])
+    return replace(_counted_anew(source, chosen, rows), starts=np.searchsorted(rows, chosen.starts).astype(np.int64))
+
+
+def _counted_anew(source: EpisodeFrames, chosen: EpisodeFrames, rows: IntArray) -> EpisodeFrames:
+    """Episodes of a data set with some of its rows alone; where they start is theirs to say."""
     # A slice of a memory map is a view, but of others it would be copied to memory, all of it.
-    sliced = slice(rows[0], rows[-1] + 1) if len(rows) == rows[-1] + 1 - rows[0] else rows
+    sliced = slice(rows[0], rows[-1] + 1) if (np.diff(rows) == 1).all() else rows
     frames = source.frames
     whole = {name: getattr(source, name) for name in ("actions", "states")}
     labels: dict[str, Any] = {name: None if values is None else values[sliced] for name, values in whole.items()}
@@ -320,7 +344,6 @@ def episode_range(source: EpisodeFrames, first: int, last: int) -> EpisodeFrames
         chosen,
         frames=frames[sliced] if isinstance(frames, np.ndarray) and sliced is not rows else RowView([frames], rows),
         shares=None if source.shares is None else source.shares.among(rows),
-        starts=np.searchsorted(rows, chosen.starts).astype(np.int64),
         **labels,
     )
 
@@ -338,10 +361,14 @@ def first_demonstrations(source: EpisodeFrames, demos: int | None) -> EpisodeFra
 
 
 def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = None) -> EpisodeFrames:
-    """The same episodes, the first `among` of them (None: all) in an order drawn by a seed."""
+    """The same episodes, the first `among` of them (None: all) in an order drawn by a seed; tasks that take turns still
+    do."""
     first = first_demonstrations(source, among)
     order = np.random.default_rng([seed, DRAW_STREAM]).permutation(first.recordings)
     how = f"drawn {seed}"
+    if first.turns:
+        tasks = recorded_tasks(first)
+        order, how = order[turns([tasks[episode] for episode in order])], f"{how} by turns"
     drawn = chosen_episodes(source, np.concatenate((order, np.arange(first.recordings, source.recordings))), how)
     return replace(drawn, fingerprint=text_hash(f"{first.fingerprint}/{how}"))
 
