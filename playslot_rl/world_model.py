@@ -122,8 +122,13 @@ class Agent(nn.Module):
             world_model,
             LatentPolicy(config.policy, slot_dim, width, config.policy.whiten, tasks=tasks),
             ActionDecoder(config.action_decoder, width, env.action_dim, slot_dim),
-            LatentPolicy(config.policy, slot_dim, env.action_dim, acts=True, tasks=tasks) if oracle else None,
+            untrained_oracle(config.policy, slot_dim, env) if oracle else None,
         )
+
+
+def untrained_oracle(sizes: PolicyConfig, slot_dim: int, env: EnvConfig) -> LatentPolicy:
+    """The policy's network for real actions of an environment, told which of its tasks where it has several."""
+    return LatentPolicy(sizes, slot_dim, env.action_dim, acts=True, tasks=len(env.tasks))
 
 
 def module_device(module: nn.Module) -> torch.device:

@@ -12,17 +12,13 @@ import torch
 
 from playslot_rl.acting.actor import Actor, SlotActor
 from playslot_rl.methods.slot_oracle.method import NAME
-from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.runs import Run
-from playslot_rl.world_model import oracle_module
+from playslot_rl.world_model import oracle_module, untrained_oracle
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a run; a CheckpointError where it or its SAVi is missing, damaged, or of other slots."""
     done, savi = run.stage(NAME, "slots"), run.load_savi(device)
     model, env = done.sizes
-    sizes, tasks = savi.config.slot_dim, len(env.tasks)
-    oracle = done.restore(
-        lambda: LatentPolicy(model.policy, sizes, env.action_dim, acts=True, tasks=tasks), "oracle", device
-    )
-    return SlotActor(savi, oracle_module(oracle), tasks=tasks)
+    oracle = done.restore(lambda: untrained_oracle(model.policy, savi.config.slot_dim, env), "oracle", device)
+    return SlotActor(savi, oracle_module(oracle), tasks=oracle.tasks)

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from playslot_rl.data.demonstrations import require_finite
-from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import cloning_alone, demonstration_views, moves
 from playslot_rl.training.fit import Part
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_behaviour import oracle_stage
+from playslot_rl.world_model import untrained_oracle
 
 
 def training(record: StageRecord) -> Training:
     config = record.config
-    device, split, width = record.device, record.demos, config.env.action_dim
-    split.trained.require_actions(width)  # before anything is computed
+    device, split = record.device, record.demos
+    split.trained.require_actions(config.env.action_dim)  # before anything is computed
     require_finite(split)
     savi = record.world.load_savi(device)
     with global_seed(config.seed, 0, record.name):
-        sizes, tasks = savi.config.slot_dim, len(config.env.tasks)
-        oracle = LatentPolicy(config.model.policy, sizes, width, acts=True, tasks=tasks).to(device)
+        oracle = untrained_oracle(config.model.policy, savi.config.slot_dim, config.env).to(device)
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
     seen, other = moves(views, config, device), moves(others, config, device) if others else None
     measured = other and (other.slots, other.actions, other.task)

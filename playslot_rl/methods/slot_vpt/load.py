@@ -11,7 +11,7 @@ from playslot_rl.config import EnvConfig, PolicyConfig
 from playslot_rl.methods.slot_vpt.method import NAME
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.runs import Run
-from playslot_rl.world_model import oracle_module
+from playslot_rl.world_model import oracle_module, untrained_oracle
 
 TWO: Final = ("labeller", "oracle")
 """As they are stored; the policy is the Slot Oracle's network."""
@@ -19,9 +19,8 @@ TWO: Final = ("labeller", "oracle")
 
 def networks(sizes: PolicyConfig, slot_dim: int, env: EnvConfig) -> tuple[LatentPolicy, LatentPolicy]:
     """Labeller, of slots and their change beside each other, and policy, untrained."""
-    width = env.action_dim
-    policy = LatentPolicy(sizes, slot_dim, width, acts=True, tasks=len(env.tasks))
-    return LatentPolicy(sizes, 2 * slot_dim, width), policy
+    policy = untrained_oracle(sizes, slot_dim, env)
+    return LatentPolicy(sizes, 2 * slot_dim, env.action_dim), policy
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
@@ -29,4 +28,4 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     done, savi = run.stage(NAME, "slots"), run.load_savi(device)
     model, env = done.sizes
     _, policy = done.restore_several(TWO, lambda: networks(model.policy, savi.config.slot_dim, env), device)
-    return SlotActor(savi, oracle_module(policy), tasks=len(env.tasks))
+    return SlotActor(savi, oracle_module(policy), tasks=policy.tasks)
