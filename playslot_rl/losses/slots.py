@@ -44,6 +44,9 @@ class SlotsLoss(LossModule):
         foreground_weight: mu.
         background: frame (3, H, W) in [0, 1], from `background`; needed where mu is not 0.
 
+    Raises:
+        ValueError: mu, but no background.
+
     Examples:
         >>> from playslot_rl.testing import tiny_agent
         >>> loss = SlotsLoss(tiny_agent().world_model.savi)
@@ -72,6 +75,11 @@ class SlotsLoss(LossModule):
         background: Tensor | None = None,
     ) -> None:
         super().__init__()
+        if foreground_weight and background is None:
+            raise ValueError(
+                f"SlotsLoss: got foreground_weight={foreground_weight:g} without a background, expected one: give what "
+                "`losses.slots.background` makes of some frames"
+            )
         self.savi, self.motion_weight, self.foreground_weight = savi, motion_weight, foreground_weight
         self.background = background
 
@@ -87,8 +95,7 @@ class SlotsLoss(LossModule):
         loss = mse
         if self.motion_weight or self.foreground_weight:
             weight = 1.0 + self.motion_weight * moving(frames)
-            if self.foreground_weight:
-                assert self.background is not None
+            if self.background is not None:
                 weight = weight + self.foreground_weight * foreground(frames, self.background)
             loss = ((weight * error.mean(2)).sum((1, 2, 3)) / weight.sum((1, 2, 3))).mean()
         return TensorDict({"loss_reconstruction": loss, "psnr": batch_psnr(mse)}, [])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -91,3 +92,8 @@ def test_what_lies_still_counts_more_where_it_is_not_the_background() -> None:
 
 def test_nothing_moves_in_a_clip_of_one_frame() -> None:
     assert moving(torch.rand(2, 1, 3, 4, 4)).sum() == 0
+
+
+def test_a_foreground_needs_a_background() -> None:
+    with pytest.raises(ValueError, match="got foreground_weight=30 without a background"):
+        SlotsLoss(tiny_agent().world_model.savi, foreground_weight=30.0)
