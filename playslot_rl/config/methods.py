@@ -91,7 +91,7 @@ class Method:
     @property
     def some_labelled(self) -> bool:
         """Whether it learns from all demonstrations, and from the real actions of some: `labels=`."""
-        return bool({"behaviour", "behaviour.labelled_demos"} & {*self.last.settings})
+        return self.last.some_labelled
 
     @property
     def one_policy(self) -> bool:

@@ -67,6 +67,11 @@ class StageSpec:
     begun_names: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def some_labelled(self) -> bool:
+        """Whether it learns from all demonstrations, and from the real actions of some (`behaviour.labelled_demos`)."""
+        return bool({"behaviour", "behaviour.labelled_demos"} & {*self.settings})
+
+    @property
     def reads(self) -> tuple[str, ...]:
         """Keys and groups that it reads; where it reads a group's `steps`, also how often to look, said beside it. What
         is typed for no stage that reads it is refused (`playslot_rl.config.method_keys`)."""

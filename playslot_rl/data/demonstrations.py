@@ -21,11 +21,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from playslot_rl.config import DataConfig, EnvConfig
+from playslot_rl.config import DataConfig
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import note_read
 from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tasks import told_tasks
 from playslot_rl.data.views import drawn_demonstrations, episode_range, first_demonstrations
 from playslot_rl.errors import DataError
 from playslot_rl.frames import normalise
@@ -239,39 +240,6 @@ def transitions(source: EpisodeFrames) -> Transitions:
     step = np.concatenate([np.arange(n) for n in steps])
     rows = np.repeat(source.starts[kept], steps) + step
     return Transitions(rows, np.repeat(number, steps), step, steps[first])
-
-
-def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Tensor | None:
-    """Which of the environment's `tasks` each transition is of, int64 (M, 1), by what the data set says of its episode;
-    None where it has one. Raises as `require_tasks`.
-    """
-    require_tasks(source, env)
-    if not env.tasks or source.tasks is None:
-        return None
-    number = {sentence: i for i, sentence in enumerate(env.sentences)}
-    there = np.flatnonzero(source.lengths >= 2)
-    there = there[np.unique(source.numbers[there], return_index=True)[1]]
-    return torch.tensor([number[said] for said in source.tasks[there].tolist()])[moves.episode][:, None]
-
-
-def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
-    """Refuse demonstrations of none of the environment's `tasks`, or of another task of its family, by a DataError; say
-    where they are of several that are not told apart.
-    """
-    said = {"nothing"} if source.tasks is None else {*source.tasks.tolist()}
-    unknown = sorted(said - {*env.sentences} if env.tasks else said & env.other_sentences)
-    if unknown:
-        raise DataError(
-            f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
-            "collect them with it"
-        )
-    tasks = sorted(said - {""})
-    if not env.tasks and len(tasks) > 1:
-        say_once(
-            f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
-            "one policy is not told apart: train on those of one, a set that `playslot dataset split` makes without "
-            "--fractions"
-        )
 
 
 def say_averaged(data: DataConfig) -> None:

@@ -29,8 +29,9 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, cloning_methods
-from playslot_rl.data.demonstrations import split_demonstrations, told_tasks, transitions
+from playslot_rl.data.demonstrations import split_demonstrations, transitions
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tasks import told_tasks
 from playslot_rl.data.videos import open_videos, places
 from playslot_rl.data.views import chosen_episodes
 from playslot_rl.data.weighted import open_configured

@@ -18,11 +18,11 @@ from playslot_rl.data.demonstrations import (
     Transitions,
     moving_slots,
     real_actions,
-    told_tasks,
     transitions,
 )
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tasks import told_tasks
 from playslot_rl.data.views import shifted_copies
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.training.fit import Part

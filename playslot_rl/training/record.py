@@ -20,9 +20,10 @@ from playslot_rl.config.stage_spec import StageSpec, group_of
 from playslot_rl.data.action_limits import ActionLimits, said, scaled
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.clips import Clips
-from playslot_rl.data.demonstrations import DemonstrationSplit, require_tasks, say_averaged, split_demonstrations
+from playslot_rl.data.demonstrations import DemonstrationSplit, say_averaged, split_demonstrations
 from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tasks import require_tasks, say_untaught
 from playslot_rl.data.videos import open_videos
 from playslot_rl.errors import CheckpointError, DataError, OutputError
 from playslot_rl.runs import Run
@@ -120,6 +121,7 @@ class StageRecord:
             )
         found = split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
         require_tasks(found.trained, config.env)
+        say_untaught(found.trained, config.env, config.behaviour.labelled_demos if self.spec.some_labelled else None)
         if found.trained.limits is not None:  # a robot's own actions
             say_averaged(data)
         return found

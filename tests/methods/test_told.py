@@ -20,7 +20,8 @@ from playslot_rl.config.metaworld import SETS
 from playslot_rl.config.methods import METHODS
 from playslot_rl.data.action_limits import ActionLimits
 from playslot_rl.data.agreement import say_once
-from playslot_rl.data.demonstrations import Demonstrations, require_tasks, told_tasks, transitions
+from playslot_rl.data.demonstrations import Demonstrations, transitions
+from playslot_rl.data.tasks import require_tasks, say_untaught, told_tasks
 from playslot_rl.data.views import concatenate, drawn_demonstrations, episode_range
 from playslot_rl.envs import task_config
 from playslot_rl.errors import ConfigError, DataError
@@ -122,6 +123,19 @@ def test_who_clones_several_tasks_untold_is_told_so(capsys: pytest.CaptureFixtur
     said = capsys.readouterr().err
     assert said.startswith("note: kitchen: got demonstrations of 2 tasks ('Cook.', 'Wash up.', ...)")
     assert said.count("\n") == 1
+
+
+def test_tasks_without_a_label_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    env = task_config("metaworld/MT10")
+    source = replace(videos(32), name="kitchen", tasks=np.array([*env.sentences[:5], env.sentences[0]]))
+    say_untaught(source, env, None)
+    said = capsys.readouterr().err
+    assert said.startswith(f"note: kitchen: got no labelled demonstration of {env.sentences[5]!r} and 4 others of")
+    say_untaught(source, env, 2)
+    assert f"demonstration of the first 2 of {env.sentences[2]!r} and 7 others of" in capsys.readouterr().err
+    say_untaught(source, task_config("metaworld/" + "+".join(env.tasks[:5])), 5)
+    say_untaught(source, task_config("metaworld/push"), 1)
+    assert not capsys.readouterr().err
 
 
 def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:

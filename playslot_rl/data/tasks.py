@@ -1,0 +1,68 @@
+"""Which of the environment's several tasks demonstrations are of, for a policy that is told.
+
+Shapes: M transitions.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from playslot_rl.config import EnvConfig
+from playslot_rl.data.agreement import say_once
+from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.views import recorded_tasks
+from playslot_rl.errors import DataError
+
+if TYPE_CHECKING:
+    from playslot_rl.data.demonstrations import Transitions
+
+
+def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Tensor | None:
+    """Which of the environment's `tasks` each transition is of, int64 (M, 1), by what the data set says of its episode;
+    None where it has one. Raises as `require_tasks`.
+    """
+    require_tasks(source, env)
+    if not env.tasks or source.tasks is None:
+        return None
+    number = {sentence: i for i, sentence in enumerate(env.sentences)}
+    there = np.flatnonzero(source.lengths >= 2)
+    there = there[np.unique(source.numbers[there], return_index=True)[1]]
+    return torch.tensor([number[said] for said in source.tasks[there].tolist()])[moves.episode][:, None]
+
+
+def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
+    """Refuse demonstrations of none of the environment's `tasks`, or of another task of its family, by a DataError; say
+    where they are of several that are not told apart.
+    """
+    said = {"nothing"} if source.tasks is None else {*source.tasks.tolist()}
+    unknown = sorted(said - {*env.sentences} if env.tasks else said & env.other_sentences)
+    if unknown:
+        raise DataError(
+            f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
+            "collect them with it"
+        )
+    tasks = sorted(said - {""})
+    if not env.tasks and len(tasks) > 1:
+        say_once(
+            f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
+            "one policy is not told apart: train on those of one, a set that `playslot dataset split` makes without "
+            "--fractions"
+        )
+
+
+def say_untaught(source: EpisodeFrames, env: EnvConfig, labelled: int | None) -> None:
+    """Say of which of the environment's `tasks` none of the first `labelled` demonstrations (None: all) is, whose
+    actions nothing teaches."""
+    shown = {*recorded_tasks(source)[:labelled]}
+    missing = [sentence for sentence in env.sentences if sentence not in shown]
+    if shown and missing:
+        number = "" if labelled is None else f" of the first {labelled}"
+        some = repr(missing[0]) + (f" and {len(missing) - 1} others" if missing[1:] else "")
+        say_once(
+            f"note: {source.name}: got no labelled demonstration{number} of {some} of env.task={env.task}, whose "
+            "actions are a guess: label more (behaviour.labelled_demos, or demos) or record some"
+        )
