@@ -199,10 +199,11 @@ def test_success_is_told_by_task() -> None:
 @pytest.mark.slow
 def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
     run, demos = tmp_path / "run", tmp_path / "demos"
+    every = ("demos=10", "behaviour.labelled_demos=10")  # one of each task: of others without a label a note says so
     smoke("collect", *MADE, "policy=expert", "episodes=11", f"out={demos}")
     smoke("train-slots", *MADE, f"data.root={demos}", f"out={run}")
     smoke("train-dynamics", f"run={run}")
-    smoke("train-policy", f"run={run}", f"data.demos={demos}")
+    smoke("train-policy", f"run={run}", f"data.demos={demos}", *every)
     done = smoke("evaluate", f"run={run}", "episodes=10", "protocol=imagination", "evaluation.references=false")
     assert all(f"{task}:" in done.out for task in MT10)
     assert "| peg-insert-side | 0 % |" in (run / "report.md").read_text()
@@ -213,10 +214,12 @@ def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
             message=r"got demonstrations of '.*', expected the tasks of env\.task=push alone")  # fmt: skip
     pushes, one = tmp_path / "pushes", tmp_path / "pushing"
     smoke("collect", *instead(MADE, "env.task=push"), "policy=expert", "episodes=6", f"out={pushes}")
-    smoke("train-policy", f"run={run}", f"out={one}", "env.task=push", f"data.demos={pushes}")
+    smoke("train-policy", f"run={run}", f"out={one}", "env.task=push", f"data.demos={pushes}", "demos=5",
+          "behaviour.labelled_demos=3")  # fmt: skip
     assert "push:" not in smoke("evaluate", f"run={one}", "episodes=2", "evaluation.references=false").out
-    for method in ("slot_bc", "slot_vpt"):
-        out, typed = tmp_path / method, ("preset=smoke", f"method={method}", f"run={run}", f"data.demos={demos}", *MADE)
+    for method, shown in (("slot_bc", every[:1]), ("slot_vpt", every)):
+        typed = ("preset=smoke", f"method={method}", f"run={run}", f"data.demos={demos}", *MADE, *shown)
+        out = tmp_path / method
         smoke("train-baseline", *typed, f"out={out}")
         assert "push:" in smoke("evaluate", f"run={out}", "episodes=2", "evaluation.references=false").out
 
