@@ -83,9 +83,11 @@ def open_videos(config: ExperimentConfig, roots: str, what: str, whole: bool = T
 def _without(source: EpisodeFrames, some: IntArray) -> EpisodeFrames:
     """A set without some of its episodes. They are told by how many are left where they are its last: another number
     would be another set to a finished stage."""
+    if not len(some):
+        return source
     kept = np.setdiff1d(np.arange(source.recordings), some)
-    if not len(some) or (some == np.arange(len(kept), source.recordings)).all():
-        return episode_range(source, 0, len(kept)) if len(some) else source
+    if kept[-1] == len(kept) - 1:
+        return episode_range(source, 0, len(kept))
     return chosen_episodes(source, kept, f"without {' '.join(map(str, some))}")
 
 

@@ -16,7 +16,7 @@ from playslot_rl.data import videos
 from playslot_rl.data.demonstrations import split_demonstrations
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.turns import turns
-from playslot_rl.data.views import by_turns, recorded_tasks, views_of_one
+from playslot_rl.data.views import by_turns, concatenate, recorded_tasks, views_of_one
 from playslot_rl.data.weighted import weighted
 from playslot_rl.evaluation.held_out import trained_on
 from playslot_rl.training.taught import taught
@@ -111,6 +111,29 @@ def test_a_world_model_is_shown_all_but_the_held_out_ones(sets: str, held: int, 
     assert {*of_tasks(seen)} == {*TASKS}
     assert tested or seen.recordings == sum(TASKS.values()) - held
     policy = split_demonstrations(videos.open_videos(config, sets, "train-policy"), None, held, 0)
+    assert policy.held_out is not None
+    assert trained_on(policy.held_out, {"slots": taught(seen, config, {}, False)}) == {"slots": 0}
+
+
+def test_of_a_set_of_several_tasks_those_of_each_are_held_out(
+    sets: str, cameras: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One set in which they lie one after the other, beside another."""
+    whole = replace(
+        concatenate([recorded("reach", cameras), recorded("push", cameras)]), fingerprint="both", name="both"
+    )
+
+    def opened(_: ExperimentConfig, roots: str) -> EpisodeFrames:
+        named = [whole if root.path == "push" else recorded(root.path, cameras) for root in data_roots(roots)]
+        return weighted(named, [None] * len(named))
+
+    monkeypatch.setattr(videos, "open_configured", opened)
+    config = compose(
+        ["env=metaworld", f"env.task={'+'.join(TASKS)}", "data.demos=push,pick-place", "data.held_out=5"]
+    )  # fmt: skip
+    seen = videos.open_videos(config, "push,pick-place", "train-slots", False)
+    assert of_tasks(seen) == {"reach": 10, "push": 10, "pick-place": 5}
+    policy = split_demonstrations(videos.open_videos(config, "push,pick-place", "train-policy"), None, 5, 0)
     assert policy.held_out is not None
     assert trained_on(policy.held_out, {"slots": taught(seen, config, {}, False)}) == {"slots": 0}
 
