@@ -220,7 +220,7 @@ def dynamics_module(world_model: WorldModel) -> TensorDictSequential:
     )
 
 
-def _observed(policy: nn.Module, observation: str = keys.SLOTS) -> list[str]:
+def observed_keys(policy: object, observation: str = keys.SLOTS) -> list[str]:
     """What a policy reads: its observation, and TASK where it is told."""
     return [observation, *([keys.TASK] if getattr(policy, "tasks", 0) else [])]
 
@@ -229,7 +229,7 @@ def latent_policy_module(policy: nn.Module) -> TensorDictModule:
     """SLOTS (..., N, D), and TASK where it is told, to LATENT_ACTION (..., [N,] Z). The same module acts in the
     simulator and in imagination.
     """
-    return TensorDictModule(policy, in_keys=_observed(policy), out_keys=[keys.LATENT_ACTION])
+    return TensorDictModule(policy, in_keys=observed_keys(policy), out_keys=[keys.LATENT_ACTION])
 
 
 def action_decoder_module(action_decoder: ActionDecoder, state: str = keys.SLOTS) -> TensorDictModule:
@@ -241,6 +241,6 @@ def action_decoder_module(action_decoder: ActionDecoder, state: str = keys.SLOTS
 def oracle_module(oracle: nn.Module, observation: str = keys.SLOTS) -> TensorDictSequential:
     """SLOTS (..., N, D), or another observation, and TASK where it is told, to ACTION (..., A), clamped to [-1, 1]."""
     return TensorDictSequential(
-        TensorDictModule(oracle, in_keys=_observed(oracle, observation), out_keys=[keys.ACTION]),
+        TensorDictModule(oracle, in_keys=observed_keys(oracle, observation), out_keys=[keys.ACTION]),
         TensorDictModule(nn.Hardtanh(), in_keys=[keys.ACTION], out_keys=[keys.ACTION]),
     )

@@ -23,7 +23,7 @@ from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.action_range import ActionRange, range_of
 from playslot_rl.modules.policy import Decides
 from playslot_rl.modules.savi import SAVi
-from playslot_rl.world_model import action_decoder_module, frame_parser_module
+from playslot_rl.world_model import action_decoder_module, frame_parser_module, observed_keys
 
 RANDOM_STREAM: Final = 7
 """Keeps random actions apart from the environment's own stream of the same seed."""
@@ -34,7 +34,8 @@ class Actor(TensorDictModuleBase):
 
     Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], or what `reads` names, and the keys of its `memory`;
     writes ACTION (n, A), in [-1, 1] but for what `executed` clips, and the memory's keys anew. In evaluation mode it is
-    a function of these inputs, so that episodes in a batch do not touch each other.
+    a function of these inputs, so that episodes in a batch do not touch each other. Where there are several `tasks` its
+    memory has TASK (n, 1), which of them an episode is of, by its seed.
 
     Attributes:
         looks: at which frames: `always`, `first` (it never sees what its actions did) or `never`. Frames that nobody
@@ -43,9 +44,9 @@ class Actor(TensorDictModuleBase):
 
     looks: Literal["always", "first", "never"] = "always"
 
-    def __init__(self, memory: Sequence[str] = (), reads: Sequence[str] = (keys.PIXELS,)) -> None:
+    def __init__(self, memory: Sequence[str] = (), reads: Sequence[str] = (keys.PIXELS,), tasks: int = 0) -> None:
         super().__init__()
-        self.memory_keys = tuple(memory)
+        self.tasks, self.memory_keys = tasks, (*memory, *([keys.TASK] if tasks else []))
         self.in_keys = [*reads, *self.memory_keys]
         self.out_keys = [keys.ACTION, *(key for key in self.memory_keys if key != keys.ACTION)]
 
@@ -68,7 +69,7 @@ class Actor(TensorDictModuleBase):
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""
-        return TensorDict({}, [len(seeds)], device=self.device)
+        return TensorDict(told(seeds, self.tasks), [len(seeds)], device=self.device)
 
     @abstractmethod
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -95,16 +96,14 @@ def told(seeds: Sequence[int], tasks: int) -> dict[str, Tensor]:
 
 
 class SlotActor(Actor):
-    """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads, which
-    are told which of several `tasks` an episode is of, TASK (n, 1), by its seed.
+    """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads.
 
     Note: initial slots that are sampled (SAVi with `initial: gaussian`) come from one generator, which `reset` seeds
     with the first episode's seed; learned ones draw nothing.
     """
 
     def __init__(self, savi: SAVi, *heads: TensorDictModuleBase, memory: Sequence[str] = (), tasks: int = 0) -> None:
-        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *memory, *([keys.TASK] if tasks else [])))
-        self.tasks = tasks
+        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *memory), tasks=tasks)
         self._slots = (savi.config.n_slots, savi.config.slot_dim)
         self.parser = frame_parser_module(savi)
         self.heads = TensorDictSequential(*heads)
@@ -115,17 +114,19 @@ class SlotActor(Actor):
         memory = super().reset(seeds)
         memory[keys.SLOT_STATE] = torch.zeros(len(seeds), *self._slots)
         memory[keys.SLOT_AGE] = torch.zeros(len(seeds), 1, dtype=torch.long)
-        return memory.update(told(seeds, self.tasks))
+        return memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return self.heads(self.parser(tensordict))
 
 
 class ReactiveActor(Actor):
-    """Observation to action without memory, by a module that reads PIXELS (n, 3, H, W) or what its `in_keys` say."""
+    """Observation to action by a module that reads PIXELS (n, 3, H, W) or what its `in_keys` say, and remembers nothing
+    but its task.
+    """
 
-    def __init__(self, module: TensorDictModuleBase) -> None:
-        super().__init__(reads=module.in_keys)
+    def __init__(self, module: TensorDictModuleBase, tasks: int = 0) -> None:
+        super().__init__(reads=[key for key in module.in_keys if key != keys.TASK], tasks=tasks)
         self.module = module
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -137,15 +138,16 @@ class _Choice(nn.Module):
         super().__init__()
         self.policy = policy
 
-    def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        features = self.policy.features(pixels)
-        return self.policy.decide(features), features
+    def forward(self, pixels: Tensor, *task: Tensor) -> tuple[Tensor, Tensor]:
+        features = self.policy.features(pixels, *task)
+        return self.policy.decide(features, *task), features
 
 
 def latent_actor(policy: Decides, decoder: ActionDecoder) -> Actor:
     """The actor of a policy from frames (n, 3, H, W) to latent actions (n, Z), which a decoder turns into real ones."""
-    choose = TensorDictModule(_Choice(policy), in_keys=[keys.PIXELS], out_keys=[keys.LATENT_ACTION, keys.FEATURES])
-    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder, keys.FEATURES)))
+    reads, tasks = observed_keys(policy, keys.PIXELS), policy.tasks
+    choose = TensorDictModule(_Choice(policy), in_keys=reads, out_keys=[keys.LATENT_ACTION, keys.FEATURES])
+    return ReactiveActor(TensorDictSequential(choose, action_decoder_module(decoder, keys.FEATURES)), tasks)
 
 
 class ExpertActor(Actor):
@@ -165,8 +167,10 @@ class PlannedActor(Actor):
 
     looks: Literal["always", "first", "never"] = "never"
 
-    def __init__(self, steps: int, action_dim: int, memory: Sequence[str] = (), reads: Sequence[str] = ()) -> None:
-        super().__init__((keys.PLANNED_ACTIONS, keys.STEP_COUNT, *memory), reads)
+    def __init__(
+        self, steps: int, action_dim: int, memory: Sequence[str] = (), reads: Sequence[str] = (), tasks: int = 0
+    ) -> None:
+        super().__init__((keys.PLANNED_ACTIONS, keys.STEP_COUNT, *memory), reads, tasks)
         self.steps, self.action_dim = steps, action_dim
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:

@@ -14,12 +14,18 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows, told
+from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows
 from playslot_rl.acting.belief import BeliefActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
-from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, oracle_module
+from playslot_rl.world_model import (
+    Agent,
+    action_decoder_module,
+    latent_policy_module,
+    observed_keys,
+    oracle_module,
+)
 
 
 def playslot_actor(agent: Agent) -> SlotActor:
@@ -76,10 +82,9 @@ class ImaginationActor(PlannedActor):
     looks = "first"
 
     def __init__(self, agent: Agent, steps: int) -> None:
-        told_key = (keys.TASK,) if agent.policy.tasks else ()
-        memory = (keys.PREDICTED_SLOTS, *told_key)
-        super().__init__(steps, agent.world_model.env.action_dim, memory, (keys.PIXELS,))
-        self.agent, self._shown = agent, (keys.PIXELS, *told_key)
+        width, tasks = agent.world_model.env.action_dim, agent.policy.tasks
+        super().__init__(steps, width, (keys.PREDICTED_SLOTS,), (keys.PIXELS,), tasks)
+        self.agent, self._shown = agent, observed_keys(agent.policy, keys.PIXELS)
         self._generator: torch.Generator | None = None
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
@@ -88,7 +93,7 @@ class ImaginationActor(PlannedActor):
         memory = super().reset(seeds)
         shape = (len(seeds), self.steps + 1, *self.agent.world_model.slot_shape)
         memory[keys.PREDICTED_SLOTS] = torch.zeros(shape)
-        return memory.update(told(seeds, self.agent.policy.tasks))
+        return memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Imagine the whole episode at its first frame; then the step's action."""

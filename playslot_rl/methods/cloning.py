@@ -33,6 +33,7 @@ from playslot_rl.data.demonstrations import (
 )
 from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tasks import told_tasks
 from playslot_rl.data.views import DIRECTIONS, IntArray, shifted_copies
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -45,6 +46,7 @@ from playslot_rl.training.stage_behaviour import JointStage, after_cloning
 from playslot_rl.training.stage_regression import (
     FrameInputs,
     Inputs,
+    PairedInputs,
     RegressionStage,
     TakenInputs,
     apply_rows,
@@ -53,13 +55,14 @@ from playslot_rl.training.stage_regression import (
 
 class Seen(NamedTuple):
     """Transitions: what the policy reads of the frame before each, the latents (M, Z) that the model infers, the real
-    actions (M, A) in [-1, 1], and which they are.
+    actions (M, A) in [-1, 1], which they are, and the task int64 (M, 1) where it is told, which `inputs` end with.
     """
 
     inputs: Inputs
     latents: Tensor
     actions: Tensor
     moves: Transitions
+    task: Tensor | None
 
 
 def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
@@ -167,14 +170,16 @@ class LatentCloning(ABC):
 
     def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:
         moves, frames, actions = moving_examples(self.config, source, self.device, shift)
-        return Seen(self.observe(frames), self.infer(source, moves), actions, moves)
+        task = task_of(source, moves, self.config, self.device)
+        inputs = PairedInputs.told(self.observe(frames), task)
+        return Seen(inputs, self.infer(source, moves), actions, moves, task)
 
     def _shown(self, labelled: Tensor) -> Demonstrations:
         """The labelled rows, then those of shifted frames."""
         demos, moved = self._decided(self.trained, labelled), self.trained.moves.rows[labelled.cpu().numpy()]
         every = torch.arange(len(moved), device=self.device)
-        frames = [FrameInputs(copy, moved, self.device, resident=False) for copy in self.copies]
-        features = [apply_rows(self.policy.features, self.observe(part), every) for part in frames]
+        frames = [self.observe(FrameInputs(copy, moved, self.device, resident=False)) for copy in self.copies]
+        features = [apply_rows(self.policy.features, PairedInputs.told(part, demos.task), every) for part in frames]
         shown, none = torch.cat((demos.slots, *features)), demos.slots[:, :0]  # what is taken apart is not copied
         taken = replace(demos, slots=none, imagined=none).take(every.repeat(1 + len(frames)))
         return replace(taken, slots=shown, imagined=shown)
@@ -184,8 +189,8 @@ class LatentCloning(ABC):
         rows, moves = rows.to(self.device), seen.moves
         features = apply_rows(self.policy.features, seen.inputs, rows)
         episode, step = (torch.from_numpy(part).to(self.device)[rows] for part in (moves.episode, moves.step))
-        lengths = torch.from_numpy(moves.lengths)
-        return Demonstrations(features, features, seen.latents[rows], seen.actions[rows], episode, step, lengths)
+        lengths, task = torch.from_numpy(moves.lengths), None if seen.task is None else seen.task[rows]
+        return Demonstrations(features, features, seen.latents[rows], seen.actions[rows], episode, step, lengths, task)
 
 
 @torch.no_grad()
@@ -211,6 +216,12 @@ def moving_examples(
     return moves, FrameInputs(source, rows, device, shift, config.data.device == "auto"), actions
 
 
+def task_of(source: EpisodeFrames, moves: Transitions, config: ExperimentConfig, device: torch.device) -> Tensor | None:
+    """The task int64 (M, 1) of transitions, where the environment has several: `told_tasks` on the device."""
+    task = told_tasks(source, moves, config.env)
+    return None if task is None else task.to(device)
+
+
 def action_stage(
     name: str,
     network: nn.Module,
@@ -229,8 +240,8 @@ def action_stage(
     """
 
     def examples(source: EpisodeFrames, shift: int = 0) -> tuple[Inputs, Tensor]:
-        _, seen, actions = moving_examples(config, source, device, shift, frames)
-        return observe(seen), actions
+        moves, seen, actions = moving_examples(config, source, device, shift, frames)
+        return PairedInputs.told(observe(seen), task_of(source, moves, config, device)), actions
 
     criterion = BehaviourLoss(network, config.behaviour.loss)
     criterion.set_keys(observation=key, action=keys.ACTION)

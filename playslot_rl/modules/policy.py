@@ -19,14 +19,20 @@ from playslot_rl.modules.whitening import Whitening
 
 
 class Decides(Protocol):
-    """A policy as an action decoder meets it."""
+    """A policy as an action decoder meets it; one of several tasks is told TASK (..., 1).
 
-    def features(self, observed: Tensor) -> Tensor:
+    Attributes:
+        tasks: how many it is told apart; 0 for one.
+    """
+
+    tasks: int
+
+    def features(self, observed: Tensor, *task: Tensor) -> Tensor:
         """What the decoder may read beside the latent action, (..., N, D), of what the policy observes."""
 
     @property
     def decide(self) -> Callable[..., Tensor]:
-        """Latent actions (..., Z) from these, and from TASK (..., 1) where it is told."""
+        """Latent actions (..., Z) from these."""
 
 
 class LatentPolicy(nn.Module):
@@ -74,7 +80,7 @@ class LatentPolicy(nn.Module):
         out: Tensor = self.head(self.encoder(slots))
         return out if self.whitening is None else self.whitening.inverse(out)
 
-    def features(self, observed: Tensor) -> Tensor:
+    def features(self, observed: Tensor, *task: Tensor) -> Tensor:  # noqa: ARG002
         """The slots themselves."""
         return observed
 

@@ -337,7 +337,7 @@ class _Both(nn.Module):
         self.tasks = getattr(policy, "tasks", 0)
 
     def forward(self, observed: Tensor, *task: Tensor) -> Tensor:
-        features = self.policy.features(observed)
+        features = self.policy.features(observed, *task)
         out: Tensor = self.decoder(self.policy.decide(features, *task), None if self.blind else features)
         return out
 

@@ -82,11 +82,11 @@ class TensorInputs:
 class PairedInputs:
     """Several inputs by row, equally long, for a network that reads more than one."""
 
-    def __init__(self, *parts: TensorInputs) -> None:
+    def __init__(self, *parts: Inputs) -> None:
         self.parts = parts
 
     @classmethod
-    def told(cls, observed: TensorInputs, task: Tensor | None) -> Inputs:
+    def told(cls, observed: Inputs, task: Tensor | None) -> Inputs:
         """What a policy reads: an observation, and the task (M, 1) where it is told."""
         return observed if task is None else cls(observed, TensorInputs(task))
 
@@ -94,10 +94,10 @@ class PairedInputs:
         return len(self.parts[0])
 
     def draw(self, rows: Tensor, generators: StepGenerators) -> tuple[Tensor, ...]:
-        return tuple(part.draw(rows, generators) for part in self.parts)
+        return tuple(each for part in self.parts for each in _several(part.draw(rows, generators)))
 
     def plain(self, rows: Tensor) -> tuple[Tensor, ...]:
-        return tuple(part.plain(rows) for part in self.parts)
+        return tuple(each for part in self.parts for each in _several(part.plain(rows)))
 
 
 class FrameInputs:

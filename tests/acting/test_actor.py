@@ -47,8 +47,9 @@ def chunks(name: str) -> Actor:
     from playslot_rl.methods.lerobot_policy.actor import ChunkActor
     from playslot_rl.methods.lerobot_policy.policy import chunk_policy
 
-    own = getattr(compose(["preset=smoke"]).baselines, name)
-    policy = chunk_policy(own, 64, 4, own.sized(8))
+    config = compose(["preset=smoke"])
+    own = getattr(config.baselines, name)
+    policy = chunk_policy(own, config.env, own.sized(8))
     policy.give(torch.randn(9, 4))
     return ChunkActor(policy, 64)
 

@@ -114,7 +114,8 @@ class CADDYBehaviour(LatentCloning):
         sizes = self.model.config
         width = sizes.actions + sizes.latent_dim
         with global_seed(config.seed, 0, POLICY):
-            self.policy = MovesHead(sizes.encoder[-1], sizes.actions, sizes.latent_dim).to(device)
+            tasks = len(config.env.tasks)
+            self.policy = MovesHead(sizes.encoder[-1], sizes.actions, sizes.latent_dim, tasks).to(device)
             self.decoder = self.new_decoder(width, 2 * sizes.encoder[-1])
         self.policy.standardise(self.trained.latents[:, sizes.actions :])
 
@@ -137,7 +138,8 @@ def oracle_stage(
     own: CADDYOracleConfig = config.baselines.caddy_oracle
     caddy = load_model(model, device)
     with global_seed(config.seed, 0, ORACLE):
-        oracle = StateHead(caddy.config.encoder[-1], config.env.action_dim, acts=True).to(device)
+        tasks = len(config.env.tasks)
+        oracle = StateHead(caddy.config.encoder[-1], config.env.action_dim, True, tasks).to(device)
 
     def observe(frames: FrameInputs) -> Inputs:
         return StateInputs(caddy.encoder, frames)

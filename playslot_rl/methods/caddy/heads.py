@@ -36,21 +36,26 @@ from playslot_rl.world_model import oracle_module
 
 
 class StateHead(nn.Module):
-    """A trunk of A's form and a linear layer to K + Z numbers, or to A real actions with their `action_range`."""
+    """A trunk of A's form and a linear layer to K + Z numbers, or to A real actions with their `action_range`; of
+    several `tasks` a learned row of each is added to the states.
+    """
 
-    def __init__(self, in_channels: int, out_dim: int, acts: bool = False) -> None:
+    def __init__(self, in_channels: int, out_dim: int, acts: bool = False, tasks: int = 0) -> None:
         super().__init__()
+        self.tasks, self.told = tasks, nn.Embedding(tasks, in_channels) if tasks else None
         self.trunk = Trunk(in_channels, 2 * in_channels)
         self.to_out = nn.Linear(2 * in_channels, out_dim)
         if acts:
             self.action_range = ActionRange(out_dim)
 
-    def forward(self, states: Tensor) -> Tensor:
-        return self.outputs(self.features(states))
+    def forward(self, states: Tensor, *task: Tensor) -> Tensor:
+        return self.outputs(self.features(states, *task))
 
-    def features(self, observed: Tensor) -> Tensor:
-        """States (B, C, H/8, W/8) to the trunk's features, as one slot (B, 1, 2C)."""
-        h: Tensor = self.trunk(observed)
+    def features(self, observed: Tensor, *task: Tensor) -> Tensor:
+        """States (B, C, H/8, W/8), and the task int64 (B, 1) where it is told, to the trunk's features, as one slot
+        (B, 1, 2C).
+        """
+        h: Tensor = self.trunk(observed if self.told is None else observed + self.told(task[0][:, 0])[..., None, None])
         return h[:, None]
 
     def outputs(self, features: Tensor) -> Tensor:
@@ -65,8 +70,8 @@ class MovesHead(StateHead):
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, in_channels: int, actions: int, latent_dim: int) -> None:
-        super().__init__(in_channels, actions + latent_dim)
+    def __init__(self, in_channels: int, actions: int, latent_dim: int, tasks: int = 0) -> None:
+        super().__init__(in_channels, actions + latent_dim, tasks=tasks)
         self.actions = actions
         self.register_buffer("mean", torch.zeros(latent_dim))
         self.register_buffer("scale", torch.ones(()))
@@ -82,7 +87,7 @@ class MovesHead(StateHead):
         out = super().outputs(features).float()
         return torch.cat((out[:, : self.actions], self.mean + self.scale * out[:, self.actions :]), dim=-1)
 
-    def decide(self, features: Tensor) -> Tensor:
+    def decide(self, features: Tensor, *task: Tensor) -> Tensor:  # noqa: ARG002
         """Moves (B, K + Z), of which only v hands a gradient on."""
         return as_moves(self.outputs(features), self.actions)
 
@@ -90,17 +95,17 @@ class MovesHead(StateHead):
 class OnFrames(nn.Module):
     def __init__(self, encoder: Encoder, head: StateHead) -> None:
         super().__init__()
-        self.encoder, self.head = encoder, head
+        self.encoder, self.head, self.tasks = encoder, head, head.tasks
 
-    def forward(self, pixels: Tensor) -> Tensor:
+    def forward(self, pixels: Tensor, *task: Tensor) -> Tensor:
         """Frames (B, 3, H, W), uint8 or float [0, 1], to moves (B, K + Z), or to actions (B, A) of an oracle."""
-        out: Tensor = self.head(states_of(self.encoder, pixels))
+        out: Tensor = self.head(states_of(self.encoder, pixels), *task)
         return as_moves(out, self.head.actions) if isinstance(self.head, MovesHead) else out
 
-    def features(self, observed: Tensor) -> Tensor:
-        return self.head.features(states_of(self.encoder, observed))
+    def features(self, observed: Tensor, *task: Tensor) -> Tensor:
+        return self.head.features(states_of(self.encoder, observed), *task)
 
-    def decide(self, features: Tensor) -> Tensor:
+    def decide(self, features: Tensor, *task: Tensor) -> Tensor:  # noqa: ARG002
         moves: Tensor = self.head.decide(features)  # type: ignore[operator]
         return moves
 
@@ -143,13 +148,15 @@ def load_policy(run: Run, device: torch.device | str = "cpu") -> Actor:
     done, caddy = run.stage(POLICY, MODEL), load_video(run, device)
     own = caddy.config
     width, k, z = own.encoder[-1], own.actions, own.latent_dim
-    parts = DecodedPolicy.load(done, lambda: MovesHead(width, k, z), k + z, 2 * width, device)
+    tasks = len(done.group(EnvConfig, "env").tasks)
+    parts = DecodedPolicy.load(done, lambda: MovesHead(width, k, z, tasks), k + z, 2 * width, device)
     return latent_actor(OnFrames(caddy.encoder, parts.policy), parts.action_decoder)
 
 
 def load_oracle(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The CADDY Oracle's actor, actions clamped to [-1, 1]; raises as `load_policy`."""
     done, caddy = run.stage(ORACLE, MODEL), load_video(run, device)
-    width = done.group(EnvConfig, "env").action_dim
-    head = done.restore(lambda: StateHead(caddy.config.encoder[-1], width, acts=True), "oracle", device)
-    return ReactiveActor(oracle_module(OnFrames(caddy.encoder, head), keys.PIXELS))
+    env = done.group(EnvConfig, "env")
+    width, tasks = caddy.config.encoder[-1], len(env.tasks)
+    head = done.restore(lambda: StateHead(width, env.action_dim, True, tasks), "oracle", device)
+    return ReactiveActor(oracle_module(OnFrames(caddy.encoder, head), keys.PIXELS), tasks)

@@ -66,5 +66,6 @@ POLICY: Final = StageSpec(
     parts="playslot_rl.methods.clam.training:policy",
 )
 CLAM: Final = Method(
-    NAME, ("CLAM",), Style(5, "*"), CLAMConfig, (MODEL, POLICY), Load(actor="playslot_rl.methods.clam.model:load_actor")
-)
+    NAME, ("CLAM",), Style(5, "*"), CLAMConfig, (MODEL, POLICY),
+    Load(actor="playslot_rl.methods.clam.model:load_actor"), told=True,
+)  # fmt: skip

@@ -111,8 +111,9 @@ def _method(
         ),
     )
     return Method(
-        name, (title,), style, config, parts, Load(actor=f"playslot_rl.methods.frozen_encoder.network:load_{stage}")
-    )
+        name, (title,), style, config, parts,
+        Load(actor=f"playslot_rl.methods.frozen_encoder.network:load_{stage}"), told=True,
+    )  # fmt: skip
 
 
 AUTOENCODER_BC: Final = _method(

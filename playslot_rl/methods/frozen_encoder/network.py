@@ -101,21 +101,27 @@ def video_encoder(own: EncoderBCConfig, image_size: int) -> VideoEncoder:
 
 class CodePolicy(nn.Module):
     """Real actions from the code of frames of `image_size`, by an encoder that stays as it is; `code` is its width and
-    its levels.
+    its levels. Of several `tasks` it is told which, as the `LatentPolicy` that is its head.
     """
 
     mean: Tensor
     std: Tensor
 
     def __init__(
-        self, encoder: nn.Module, config: PolicyConfig, code: tuple[int, int], image_size: int, out_dim: int
+        self,
+        encoder: nn.Module,
+        config: PolicyConfig,
+        code: tuple[int, int],
+        image_size: int,
+        out_dim: int,
+        tasks: int = 0,
     ) -> None:
         super().__init__()
         self.encoder = encoder.requires_grad_(False)
         width, levels = code
-        side = image_size // 2**levels
+        side, self.tasks = image_size // 2**levels, tasks
         self.position = nn.Parameter(torch.randn(side * side, width) * 0.02)
-        self.head = LatentPolicy(config.of_frames, width, out_dim, acts=True)
+        self.head = LatentPolicy(config.of_frames, width, out_dim, acts=True, tasks=tasks)
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("std", torch.ones(width))
 
@@ -137,9 +143,11 @@ class CodePolicy(nn.Module):
         self.mean.copy_(tokens.mean(0))
         self.std.copy_(tokens.std(0).clamp(min=1e-3))
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        """Frames (B, 3, H, W), uint8 or float [0, 1], to actions (B, A), not clamped."""
-        actions: Tensor = self.head((self.code(pixels) - self.mean) / self.std + self.position)
+    def forward(self, pixels: Tensor, *task: Tensor) -> Tensor:
+        """Frames (B, 3, H, W), uint8 or float [0, 1], and the task int64 (B, 1) where it is told, to actions (B, A),
+        not clamped.
+        """
+        actions: Tensor = self.head((self.code(pixels) - self.mean) / self.std + self.position, *task)
         return actions
 
 
@@ -150,9 +158,9 @@ def _load(name: str, parent: str, kind: type[EncoderBCConfig], run: Run, device:
 
     def build() -> CodePolicy:
         encoder = video_encoder(own, env.image_size).encoder
-        return CodePolicy(encoder, model.policy, own.code, env.image_size, env.action_dim)
+        return CodePolicy(encoder, model.policy, own.code, env.image_size, env.action_dim, len(env.tasks))
 
-    return ReactiveActor(oracle_module(done.restore(build, "policy", device), keys.PIXELS))
+    return ReactiveActor(oracle_module(done.restore(build, "policy", device), keys.PIXELS), len(env.tasks))
 
 
 load_autoencoder = partial(_load, AUTOENCODER_BC.name, "autoencoder", AutoencoderBCConfig)

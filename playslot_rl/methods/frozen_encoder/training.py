@@ -92,10 +92,9 @@ def policy(record: StageRecord) -> Training:
     own, (parent,) = _settings(record), record.spec.parents
     require_finite(split)
     with global_seed(config.seed, 0, record.name):
-        encoder = video_encoder(own, config.env.image_size)
-        network = CodePolicy(
-            encoder.encoder, config.model.policy, own.code, config.env.image_size, config.env.action_dim
-        )
+        encoder, env = video_encoder(own, config.env.image_size), config.env
+        sizes = own.code, env.image_size, env.action_dim, len(env.tasks)
+        network = CodePolicy(encoder.encoder, config.model.policy, *sizes)
     load_weights(record.parents[parent], {parent: encoder})
     network.to(device)
     stage = action_stage(
@@ -103,6 +102,5 @@ def policy(record: StageRecord) -> Training:
     )
     rows = torch.linspace(0, len(stage.targets) - 1, min(STANDARDISED, len(stage.targets))).long()
     seen = stage.inputs.plain(rows)
-    assert isinstance(seen, Tensor)
-    network.eval().standardise(seen)
+    network.eval().standardise(seen if isinstance(seen, Tensor) else seen[0])
     return cloning_alone(record, Part(f"{own.group}policy", stage, own.policy), len(stage.targets))

@@ -85,5 +85,6 @@ POLICY: Final = StageSpec(
     sizes="playslot_rl.methods.cloning:sizes",
 )  # fmt: skip
 LAOM: Final = Method(
-    NAME, ("LAOM",), Style(5, "H"), LAOMConfig, (MODEL, POLICY), Load(actor="playslot_rl.methods.laom.model:load_actor")
-)
+    NAME, ("LAOM",), Style(5, "H"), LAOMConfig, (MODEL, POLICY),
+    Load(actor="playslot_rl.methods.laom.model:load_actor"), told=True,
+)  # fmt: skip

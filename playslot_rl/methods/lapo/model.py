@@ -98,10 +98,12 @@ class EncoderMLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.out(self.hidden(x))
 
-    def hidden(self, x: Tensor) -> Tensor:
-        """(B, 3 F, H, W) to the hidden layer, (B, hidden), after its ReLU."""
-        h: Tensor = self.mlp[:2](self.encoder(x)[-1].flatten(1))
-        return h
+    def hidden(self, x: Tensor, start: Tensor | None = None, shift: Tensor | float = 0.0) -> Tensor:
+        """(B, 3 F, H, W) to the hidden layer, (B, hidden), after its ReLU, to which `shift` (B, hidden) is added before
+        it; `start` as in `ConvEncoder`.
+        """
+        h: Tensor = self.mlp[0](self.encoder(x, start)[-1].flatten(1))
+        return F.relu(h + shift)
 
     def out(self, hidden: Tensor) -> Tensor:
         """(B, hidden) to (B, Z)."""
@@ -221,28 +223,37 @@ class ForwardModel(ChangeUNet):
 
 
 class LAPOPolicy(nn.Module):
-    """LAPO's latent policy, and that of the methods after it: frames (B, 3, H, W), uint8 or float [0, 1], to latent
-    actions (B, Z); `config` are the settings of one of them.
+    """LAPO's latent policy, and that of the methods after it: frames (B, 3, H, W), uint8 or float [0, 1], and the task
+    int64 (B, 1) where it is told, to latent actions (B, Z); `config` are the settings of one of them.
+
+    Note: LAPO's is of one task. Of several, a learned row of each enters where the forward model takes a latent: behind
+    the first conv, and behind the encoder.
     """
 
-    def __init__(self, config: Any, image_size: int) -> None:
+    def __init__(self, config: Any, image_size: int, tasks: int = 0) -> None:
         super().__init__()
         self.network = EncoderMLP(config, 1, image_size)
+        self.tasks, self._widths = tasks, (config.channels[0], config.hidden)
+        self.told = nn.Embedding(tasks, sum(self._widths)) if tasks else None
+        if self.told is not None:
+            nn.init.normal_(self.told.weight, std=0.1)  # about as large as what it is added to
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        return self.decide(self.features(pixels))
+    def forward(self, pixels: Tensor, *task: Tensor) -> Tensor:
+        return self.decide(self.features(pixels, *task))
 
-    def features(self, observed: Tensor) -> Tensor:
+    def features(self, observed: Tensor, *task: Tensor) -> Tensor:
         """Frames to the hidden layer, as one slot (B, 1, hidden)."""
-        return self.network.hidden(normalise(observed))[:, None]
+        said = () if self.told is None else self.told(task[0][:, 0]).split(self._widths, dim=-1)
+        return self.network.hidden(normalise(observed), *said)[:, None]
 
-    def decide(self, features: Tensor) -> Tensor:
+    def decide(self, features: Tensor, *task: Tensor) -> Tensor:  # noqa: ARG002
         return self.network.out(features[:, 0])
 
 
 def pixel_actor(done: StageCheckpoint, own: Any, device: torch.device | str) -> Actor:
     """The actor of a finished policy, and of the decoder beside it."""
-    build = partial(LAPOPolicy, own, done.sizes[1].image_size)
+    env = done.sizes[1]
+    build = partial(LAPOPolicy, own, env.image_size, len(env.tasks))
     parts = DecodedPolicy.load(done, build, own.latent_dim, own.hidden, device)
     return latent_actor(parts.policy, parts.action_decoder)
 

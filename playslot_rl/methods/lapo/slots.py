@@ -14,6 +14,8 @@ Shapes: B batch, F frames, N slots, D slot width, Z latent-action width.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 
@@ -84,6 +86,8 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     """The actor of a finished run; a CheckpointError where a stage is missing, damaged, or of another parent."""
     done, savi = run.stage(NAME, "slots", MODEL.name), run.load_savi(device)
     own, width = done.group(LAPOSlotsConfig, NAME), savi.config.slot_dim
-    sizes = done.sizes[0].policy
-    parts = DecodedPolicy.load(done, lambda: LatentPolicy(sizes, width, own.latent_dim), own.latent_dim, width, device)
-    return SlotActor(savi, latent_policy_module(parts.policy), action_decoder_module(parts.action_decoder))
+    model, env = done.sizes
+    build = partial(LatentPolicy, model.policy, width, own.latent_dim, tasks=len(env.tasks))
+    parts = DecodedPolicy.load(done, build, own.latent_dim, width, device)
+    heads = latent_policy_module(parts.policy), action_decoder_module(parts.action_decoder)
+    return SlotActor(savi, *heads, tasks=len(env.tasks))

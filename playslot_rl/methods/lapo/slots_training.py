@@ -21,6 +21,7 @@ from playslot_rl.data.demonstrations import Transitions, moving_slots, real_acti
 from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.data.tasks import told_tasks
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred
 from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
@@ -32,7 +33,7 @@ from playslot_rl.seeds.draws import global_seed
 from playslot_rl.training.demonstrated import demonstration_views
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
-from playslot_rl.training.stage_regression import TensorInputs
+from playslot_rl.training.stage_regression import PairedInputs, TensorInputs
 
 
 def model(record: StageRecord) -> Training:
@@ -66,7 +67,8 @@ class LAPOSlotsBehaviour(LatentCloning):
         schedule = StageConfig(**{part.name: getattr(config.behaviour, part.name) for part in fields(StageConfig)})
         super().__init__(config, demos, device, 0, schedule, config.behaviour.loss)
         with global_seed(config.seed, 0, record.name):
-            self.policy = LatentPolicy(config.model.policy, width, own.latent_dim).to(device)
+            tasks = len(config.env.tasks)
+            self.policy = LatentPolicy(config.model.policy, width, own.latent_dim, tasks=tasks).to(device)
             decoder = record.groups["model"].action_decoder  # which reads the slots that the policy sees
             self.decoder = ActionDecoder(decoder, own.latent_dim, config.env.action_dim, width).to(device)
 
@@ -88,8 +90,10 @@ class LAPOSlotsBehaviour(LatentCloning):
         parts = ([getattr(m, name) for m in moves] for name in ("rows", "episode", "step"))
         rows, episode, step = map(np.concatenate, parts)
         joined = Transitions(rows, episode, step, moves[0].lengths)
-        inputs = TensorInputs(torch.cat(slots).to(self.device), self.noise, "policy_noise")
-        return Seen(inputs, torch.cat(latents), torch.cat(actions).to(self.device), joined)
+        told = [told_tasks(v, m, self.config.env) for v, m in zip(views, moves, strict=True)]
+        task = torch.cat([one for one in told if one is not None]).to(self.device) if None not in told else None
+        inputs = PairedInputs.told(TensorInputs(torch.cat(slots).to(self.device), self.noise, "policy_noise"), task)
+        return Seen(inputs, torch.cat(latents), torch.cat(actions).to(self.device), joined, task)
 
 
 def policy(record: StageRecord) -> Training:

@@ -133,7 +133,7 @@ class PixelCloning(LatentCloning):
         own = getattr(config.baselines, record.name)
         super().__init__(config, record.demos, device, shift, own.policy, loss)
         with global_seed(config.seed, 0, record.name):
-            self.policy = LAPOPolicy(own, config.env.image_size).to(device)
+            self.policy = LAPOPolicy(own, config.env.image_size, len(config.env.tasks)).to(device)
             self.decoder = self.new_decoder(own.latent_dim, own.hidden)
 
 

@@ -18,7 +18,7 @@ from playslot_rl.acting.actor import Actor, with_present
 from playslot_rl.config import EnvConfig
 from playslot_rl.frames import normalise
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig, DiffusionConfig
-from playslot_rl.methods.lerobot_policy.policy import ChunkPolicy, chunk_policy
+from playslot_rl.methods.lerobot_policy.policy import ChunkPolicy, Observation, chunk_policy
 from playslot_rl.runs import Run
 from playslot_rl.seeds.draws import derived_seed
 
@@ -31,7 +31,7 @@ class ChunkActor(Actor):
     def __init__(self, policy: ChunkPolicy, image_size: int) -> None:
         memory = (keys.FRAME_HISTORY, keys.PLANNED_ACTIONS, keys.STEP_COUNT, keys.NOISE_SEED)
         reads = (keys.PIXELS, keys.STATE) if policy.state_dim else (keys.PIXELS,)
-        super().__init__((*memory, *([keys.STATE_HISTORY] if policy.state_dim else [])), reads)
+        super().__init__((*memory, *([keys.STATE_HISTORY] if policy.state_dim else [])), reads, policy.tasks)
         self.policy, self.image_size = policy, image_size
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
@@ -56,9 +56,9 @@ class ChunkActor(Actor):
         if len(due):
             drawn = zip(tensordict.get(keys.NOISE_SEED)[due, 0].tolist(), step[due, 0].tolist(), strict=True)
             seeds = [derived_seed(seed, number, "noise") for seed, number in drawn]
-            plan = plan.index_copy(
-                0, due, self.policy.plan(frames[due], seeds, None if states is None else states[due])
-            )
+            task = tensordict.get(keys.TASK)[due] if self.tasks else None
+            seen = Observation(frames[due], None if states is None else states[due], task)
+            plan = plan.index_copy(0, due, self.policy.plan(seen, seeds))
         action = plan[torch.arange(len(plan), device=plan.device), at]
         return tensordict.update(
             {
@@ -77,7 +77,7 @@ def _load(name: str, kind: type[ChunkConfig], run: Run, device: torch.device | s
     done = run.stage(name)
     own, env = done.group(kind, name), done.group(EnvConfig, "env")
     chunk, state = int(done.meta["chunk"]), int(done.meta.get("state", 0))
-    policy = done.restore(lambda: chunk_policy(own, env.image_size, env.action_dim, chunk, state), "policy", device)
+    policy = done.restore(lambda: chunk_policy(own, env, chunk, state), "policy", device)
     return ChunkActor(policy, env.image_size)
 
 

@@ -184,8 +184,9 @@ def _method(
         names={f"baselines.{group}": name} if group else {},
     )
     return Method(
-        name, titles, style, config, (stage,), Load(actor=f"playslot_rl.methods.lerobot_policy.actor:load_{name}")
-    )
+        name, titles, style, config, (stage,),
+        Load(actor=f"playslot_rl.methods.lerobot_policy.actor:load_{name}"), told=True,
+    )  # fmt: skip
 
 
 ACT: Final = _method("act", ("ACT",), Style(6, "d"), ACTConfig)

@@ -5,22 +5,26 @@
 `pre` and `post` are LeRobot's processors: frames by ImageNet's statistics, as `lerobot-train` has it, actions by those
 and, where it is seen, proprioception by those of the labelled demonstrations, stored with the weights.
 
+Of several tasks the policy is told which, one of K numbers that is 1, as LeRobot's `observation.environment_state`.
+
 Note: without proprioception, which LeRobot's Diffusion Policy cannot do without, it is one number that is 0. LeRobot
 freezes the BatchNorm layers of ACT's ResNet-18, which without ImageNet's weights are the identity: here they then
 learn.
 
-Shapes: B batch, F frames, H actions of a chunk, E of them executed, A action dim, S proprioception, 0 without.
+Shapes: B batch, F frames, H actions of a chunk, E of them executed, A action dim, S proprioception, 0 without, K tasks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from playslot_rl import keys
+from playslot_rl.config import EnvConfig
 from playslot_rl.frames import IMAGENET_MEAN, IMAGENET_STD, normalise
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig, DiffusionConfig, require_diffusers
 from playslot_rl.modules.action_range import ActionRange
@@ -31,21 +35,36 @@ TRUNK = ("conv1", "bn1", "relu", "maxpool", "layer1", "layer2", "layer3", "layer
 """ResNet-18's parts in order; LeRobot's Diffusion Policy numbers them."""
 
 
+class Observation(NamedTuple):
+    """What a policy observes: frames (B, F, 3, W, W), uint8 or float [0, 1], proprioception (B, F, S) where it is seen,
+    and the task int64 (B, 1) where it is told.
+    """
+
+    pixels: Tensor
+    states: Tensor | None = None
+    task: Tensor | None = None
+
+
 class ChunkPolicy(nn.Module):
     """ACT or Diffusion Policy for frames of `image_size` and chunks of H; `make` and `chunks` are theirs."""
 
     statistics: Tensor
     state_statistics: Tensor
 
-    def __init__(self, own: ChunkConfig, image_size: int, action_dim: int, chunk: int, state_dim: int = 0) -> None:
+    def __init__(
+        self, own: ChunkConfig, image_size: int, action_dim: int, chunk: int, state_dim: int = 0, tasks: int = 0
+    ) -> None:
         super().__init__()
         from lerobot.configs import FeatureType, PolicyFeature
+        from lerobot.utils.constants import OBS_ENV_STATE
 
         self.frames, self.chunk, self.executed, self.state_dim = own.frames, chunk, own.kept(chunk), state_dim
+        self.tasks = tasks
         image = PolicyFeature(FeatureType.VISUAL, (3, image_size, image_size))
         state = {keys.FEATURE_STATE: PolicyFeature(FeatureType.STATE, (state_dim,))} if state_dim else {}
+        task = {OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (tasks,))} if tasks else {}
         shared = {
-            "input_features": {keys.FEATURE_IMAGE: image, **state},
+            "input_features": {keys.FEATURE_IMAGE: image, **state, **task},
             "output_features": {keys.FEATURE_ACTION: PolicyFeature(FeatureType.ACTION, (action_dim,))},
             "n_action_steps": self.executed,
             "pretrained_backbone_weights": None,  # they are loaded by us, from where `weights` says
@@ -100,32 +119,34 @@ class ChunkPolicy(nn.Module):
             self.set_submodule(name, norm)
         return bool(frozen)
 
-    def loss(self, pixels: Tensor, actions: Tensor, pad: Tensor, states: Tensor | None = None) -> Tensor:
-        """LeRobot's loss of frames (B, F, 3, W, W), chunks (B, H, A) in [-1, 1], where these are padding (B, H), and
-        proprioception (B, F, S).
-        """
-        batch = self._pre({**self.observed(pixels, states), keys.FEATURE_ACTION: actions, PAD: pad})
+    def loss(self, seen: Observation, actions: Tensor, pad: Tensor) -> Tensor:
+        """LeRobot's loss of chunks (B, H, A) in [-1, 1], where these are padding (B, H)."""
+        batch = self._pre({**self.observed(seen), keys.FEATURE_ACTION: actions, PAD: pad})
         loss: Tensor = self.policy.forward(batch)[0]
         return loss
 
     @torch.no_grad()
-    def plan(self, pixels: Tensor, seeds: Sequence[int], states: Tensor | None = None) -> Tensor:
-        """The actions (B, E, A) to execute, from frames (B, F, 3, W, W) and proprioception (B, F, S); what is drawn
-        hangs on a row's seed alone.
-        """
-        actions = self.chunks(self._pre(self.observed(pixels, states)), seeds)
-        planned: Tensor = self._post(actions).to(pixels.device)
+    def plan(self, seen: Observation, seeds: Sequence[int]) -> Tensor:
+        """The actions (B, E, A) to execute; what is drawn hangs on a row's seed alone."""
+        actions = self.chunks(self._pre(self.observed(seen)), seeds)
+        planned: Tensor = self._post(actions).to(seen.pixels.device)
         return planned
 
     def chunks(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:
         """Chunks that begin with the present action, less what is not executed, normalised."""
         raise NotImplementedError
 
-    def observed(self, pixels: Tensor, states: Tensor | None = None) -> dict[str, Tensor]:
-        """What LeRobot's policy sees, by the names of its data sets."""
+    def observed(self, seen: Observation) -> dict[str, Tensor]:
+        """What LeRobot's policy sees, by the names of its data sets, (B, F, ...)."""
+        from lerobot.utils.constants import OBS_ENV_STATE
+
+        pixels, states, task = seen
         if states is None:
             states = torch.zeros(*pixels.shape[:2], 1, device=pixels.device)
-        return {keys.FEATURE_IMAGE: normalise(pixels), keys.FEATURE_STATE: states}
+        known = {keys.FEATURE_IMAGE: normalise(pixels), keys.FEATURE_STATE: states}
+        if task is not None:
+            known[OBS_ENV_STATE] = F.one_hot(task, self.tasks).float().expand(-1, self.frames, -1)
+        return known
 
     def _pre(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         found: dict[str, Tensor] = self._made()[0](batch)
@@ -165,8 +186,8 @@ class ACTChunks(ChunkPolicy):
         backbone: nn.Module = self.policy.model.backbone
         return backbone, {name: name for name in backbone.state_dict()}
 
-    def observed(self, pixels: Tensor, states: Tensor | None = None) -> dict[str, Tensor]:
-        return {name: value[:, 0] for name, value in super().observed(pixels, states).items()}
+    def observed(self, seen: Observation) -> dict[str, Tensor]:
+        return {name: value[:, 0] for name, value in super().observed(seen).items()}
 
     def chunks(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:  # noqa: ARG002
         actions: Tensor = self.policy.predict_action_chunk(batch)
@@ -216,10 +237,10 @@ class DiffusionChunks(ChunkPolicy):
         return actions[:, self.frames - 1 : self.frames - 1 + self.executed]
 
 
-def chunk_policy(own: ChunkConfig, image_size: int, action_dim: int, chunk: int, state_dim: int = 0) -> ChunkPolicy:
+def chunk_policy(own: ChunkConfig, env: EnvConfig, chunk: int, state_dim: int = 0) -> ChunkPolicy:
     """The untrained policy that these settings are of; a ConfigError where its library is missing."""
     kind = DiffusionChunks if isinstance(own, DiffusionConfig) else ACTChunks
-    return kind(own, image_size, action_dim, chunk, state_dim)
+    return kind(own, env.image_size, env.action_dim, chunk, state_dim, len(env.tasks))
 
 
 def _statistics(values: Tensor) -> Tensor:

@@ -24,8 +24,9 @@ from playslot_rl import keys
 from playslot_rl.config import ExperimentConfig, OptimConfig
 from playslot_rl.data.demonstrations import moving_frames, real_actions, require_finite, transitions
 from playslot_rl.data.source import EpisodeFrames
+from playslot_rl.methods.cloning import task_of
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig
-from playslot_rl.methods.lerobot_policy.policy import PAD, ChunkPolicy, chunk_policy
+from playslot_rl.methods.lerobot_policy.policy import PAD, ChunkPolicy, Observation, chunk_policy
 from playslot_rl.methods.resnet_oracle.network import load_trunk
 from playslot_rl.runtime.devices import to_device
 from playslot_rl.runtime.precision import autocast
@@ -38,22 +39,30 @@ from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import HELD_OUT, FrameInputs, unexplained
 
+SEEN = (keys.PIXELS, keys.STATE, keys.TASK)
+"""An `Observation`, in a batch."""
 VALIDATED = 128
 """Rows of each set that a validation predicts chunks of."""
 
 
 class Chunks(NamedTuple):
     """Rows: frames (M, F), the actions (M, H, A) in [-1, 1] that are predicted from them, which of these are padding,
-    bool (M, H), and proprioception (M, F, S) where it is seen.
+    bool (M, H), proprioception (M, F, S) where it is seen, and the task int64 (M, 1) where it is told.
     """
 
     frames: FrameInputs
     actions: Tensor
     pad: Tensor
-    states: Tensor | None = None
+    states: Tensor | None
+    task: Tensor | None
 
     def __len__(self) -> int:
         return len(self.actions)
+
+    def observed(self, rows: Tensor, pixels: Tensor) -> Observation:
+        """What is seen at rows (B,), beside their frames (B, F, 3, W, W)."""
+        there = to_device(rows, self.actions.device)
+        return Observation(pixels, *(None if part is None else part[there] for part in (self.states, self.task)))
 
 
 def chunked(
@@ -82,7 +91,9 @@ def chunked(
     frames = FrameInputs(source, seen, device, shift, config.data.device == "auto")
     pad = torch.from_numpy((wanted < first) | (wanted > last)).to(device)
     states = torch.from_numpy(source.require_states()[seen]).to(device) if state else None
-    return Chunks(frames, actions.to(device), pad, states)
+    task = task_of(source, moves, config, device)
+    task = None if task is None else task[torch.from_numpy(kept).to(device)]
+    return Chunks(frames, actions.to(device), pad, states, task)
 
 
 class ChunkStage:
@@ -107,14 +118,15 @@ class ChunkStage:
         rows = own_rows(drawn)
         there = to_device(rows, self.trained.actions.device)
         pixels = self.trained.frames.draw(rows, generators)
-        states = {} if self.trained.states is None else {keys.STATE: self.trained.states[there]}
-        return {keys.PIXELS: pixels, keys.ACTION: self.trained.actions[there], PAD: self.trained.pad[there], **states}
+        seen = zip(SEEN, self.trained.observed(rows, pixels), strict=True)
+        known = {key: value for key, value in seen if value is not None}
+        return {**known, keys.ACTION: self.trained.actions[there], PAD: self.trained.pad[there]}
 
     def loss(self, batch: Mapping[str, Tensor], step: int, generators: StepGenerators) -> Mapping[str, Tensor]:  # noqa: ARG002
         """Note: dropout, the VAE's and the diffusion's noise are drawn for each share of a batch alike."""
         with autocast(batch[keys.PIXELS].device.type, self.own.precision):
-            seen = batch[keys.PIXELS], batch[keys.ACTION], batch[PAD], batch.get(keys.STATE)
-            return {"loss": self.policy.loss(*seen).float()}
+            seen = Observation(batch[keys.PIXELS], batch.get(keys.STATE), batch.get(keys.TASK))
+            return {"loss": self.policy.loss(seen, batch[keys.ACTION], batch[PAD]).float()}
 
     def validate(self, step: int) -> Mapping[str, float]:  # noqa: ARG002
         """Unexplained fraction of the variance of the actions that are executed."""
@@ -123,8 +135,7 @@ class ChunkStage:
     def _compared(self, chunks: Chunks) -> tuple[Tensor, Tensor]:
         rows = torch.linspace(0, len(chunks) - 1, min(VALIDATED, len(chunks))).long()
         there, begin = to_device(rows, chunks.actions.device), self.own.frames - 1
-        states = None if chunks.states is None else chunks.states[there]
-        predicted = self.policy.plan(chunks.frames.plain(rows), rows.tolist(), states)
+        predicted = self.policy.plan(chunks.observed(rows, chunks.frames.plain(rows)), rows.tolist())
         shown = slice(begin, begin + self.policy.executed)
         real = ~chunks.pad[there][:, shown]
         return predicted[real], chunks.actions[there][:, shown][real]
@@ -146,7 +157,7 @@ def training(record: StageRecord, state: bool = False) -> Training:
     chunk = own.sized(int(moves.lengths.max()))
     states = torch.from_numpy(split.trained.require_states()[moves.rows]) if state else None
     with global_seed(config.seed, 0, record.name):
-        policy = chunk_policy(own, config.env.image_size, width, chunk, 0 if states is None else states.shape[1])
+        policy = chunk_policy(own, config.env, chunk, 0 if states is None else states.shape[1])
     trunk, names = policy.trunk()
     pretraining = load_trunk(trunk, own.weights, f"{group}.weights", names)
     learned = pretraining == "scratch" and policy.learn_norms()

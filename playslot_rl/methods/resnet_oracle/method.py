@@ -72,9 +72,13 @@ _WITH_HISTORY: Final = replace(
     parts="playslot_rl.methods.resnet_oracle.training:with_history",
     names={"baselines.resnet_oracle": HISTORY},
 )
-RESNET_ORACLE: Final = Method(NAME, ("ResNet Oracle", "ResNet"), Style(1, "v"), ResNetOracleConfig, (STAGE,), _LOAD)
-RESNET_BC: Final = Method("resnet_bc", ("ResNet BC",), Style(1, ">"), None, (replace(STAGE, data="labelled"),), _LOAD)
+RESNET_ORACLE: Final = Method(
+    NAME, ("ResNet Oracle", "ResNet"), Style(1, "v"), ResNetOracleConfig, (STAGE,), _LOAD, told=True
+)
+RESNET_BC: Final = Method(
+    "resnet_bc", ("ResNet BC",), Style(1, ">"), None, (replace(STAGE, data="labelled"),), _LOAD, told=True
+)
 HISTORY_BC: Final = Method(
     HISTORY, ("ResNet BC with history",), Style(1, "$H$"), None, (_WITH_HISTORY,),
-    Load(actor="playslot_rl.methods.resnet_oracle.network:load_with_history"),
+    Load(actor="playslot_rl.methods.resnet_oracle.network:load_with_history"), told=True,
 )  # fmt: skip

@@ -15,6 +15,7 @@ Shapes: B batch, F frames, H W image height and width, h w those of the feature 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -38,20 +39,22 @@ Pretraining = Literal["imagenet", "scratch"]
 
 
 class ResNetPolicy(nn.Module):
-    """Real actions from frames H = W = `image_size`, a multiple of 32; from the last `frames` of them."""
+    """Real actions from frames H = W = `image_size`, a multiple of 32; from the last `frames` of them. Of several
+    `tasks` it is told which, as the `LatentPolicy` that is its head.
+    """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, config: PolicyConfig, image_size: int, out_dim: int, frames: int = 1) -> None:
+    def __init__(self, config: PolicyConfig, image_size: int, out_dim: int, frames: int = 1, tasks: int = 0) -> None:
         from torchvision.models import resnet18
 
         super().__init__()
         trunk = resnet18(weights=None)
         trunk.avgpool, trunk.fc = nn.Identity(), nn.Identity()
-        self.trunk, self.frames = trunk, frames
+        self.trunk, self.frames, self.tasks = trunk, frames, tasks
         self.position = nn.Parameter(torch.randn(frames * (image_size // 32) ** 2, WIDTH) * 0.02)
-        self.head = LatentPolicy(config.of_frames, WIDTH, out_dim, acts=True)
+        self.head = LatentPolicy(config.of_frames, WIDTH, out_dim, acts=True, tasks=tasks)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(3, 1, 1), persistent=False)
 
@@ -60,9 +63,11 @@ class ResNetPolicy(nn.Module):
         flat: Tensor = self.trunk((normalise(pixels).flatten(0, -4) - self.mean) / self.std)
         return flat.view(len(flat), WIDTH, -1).transpose(1, 2).reshape(len(pixels), -1, WIDTH)
 
-    def forward(self, pixels: Tensor) -> Tensor:
-        """Frames (B, [F,] 3, H, W), uint8 or float [0, 1], to actions (B, A), not clamped."""
-        actions: Tensor = self.head(self.features(pixels) + self.position)
+    def forward(self, pixels: Tensor, *task: Tensor) -> Tensor:
+        """Frames (B, [F,] 3, H, W), uint8 or float [0, 1], and the task int64 (B, 1) where it is told, to actions
+        (B, A), not clamped.
+        """
+        actions: Tensor = self.head(self.features(pixels) + self.position, *task)
         return actions
 
 
@@ -97,14 +102,14 @@ def _download(url: str, path: Path, key: str) -> None:
 
 def resnet_actor(policy: ResNetPolicy) -> Actor:
     """The actor of a policy in evaluation mode; actions clamped to [-1, 1]."""
-    return ReactiveActor(oracle_module(policy, keys.PIXELS))
+    return ReactiveActor(oracle_module(policy, keys.PIXELS), policy.tasks)
 
 
 class HistoryActor(Actor):
     """The last F frames (n, F, 3, W, W), its memory, to ACTION (n, A), clamped to [-1, 1]."""
 
     def __init__(self, policy: ResNetPolicy, image_size: int) -> None:
-        super().__init__((keys.FRAME_HISTORY, keys.STEP_COUNT))
+        super().__init__((keys.FRAME_HISTORY, keys.STEP_COUNT), tasks=policy.tasks)
         self.policy, self.image_size = policy, image_size
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
@@ -116,7 +121,8 @@ class HistoryActor(Actor):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         step = tensordict.get(keys.STEP_COUNT)
         frames = with_present(tensordict.get(keys.FRAME_HISTORY), normalise(tensordict.get(keys.PIXELS)), step)
-        actions = self.policy(frames).clamp(-1, 1)
+        task = [tensordict.get(keys.TASK)] if self.tasks else []
+        actions = self.policy(frames, *task).clamp(-1, 1)
         return tensordict.update({keys.ACTION: actions, keys.FRAME_HISTORY: frames, keys.STEP_COUNT: step + 1})
 
 
@@ -134,4 +140,5 @@ def load_with_history(run: Run, device: torch.device | str = "cpu") -> Actor:
 def _load(run: Run, stage: str, frames: int, device: torch.device | str) -> ResNetPolicy:
     done = run.stage(stage)
     model, env = done.sizes
-    return done.restore(lambda: ResNetPolicy(model.policy, env.image_size, env.action_dim, frames), "policy", device)
+    build = partial(ResNetPolicy, model.policy, env.image_size, env.action_dim, frames, len(env.tasks))
+    return done.restore(build, "policy", device)

@@ -27,7 +27,8 @@ def training(record: StageRecord, frames: int = 1) -> Training:
     own: ResNetOracleConfig = config.baselines.resnet_oracle
     require_finite(split)
     with global_seed(config.seed, 0, record.name):
-        policy = ResNetPolicy(config.model.policy, config.env.image_size, config.env.action_dim, frames)
+        env = config.env
+        policy = ResNetPolicy(config.model.policy, env.image_size, env.action_dim, frames, len(env.tasks))
     pretraining = load_trunk(policy.trunk, own.weights, f"baselines.{NAME}.weights")
     policy.to(device)
     stage = action_stage("policy", policy, keys.PIXELS, lambda x: x, config, split, device, own.shift, own, 512, frames)

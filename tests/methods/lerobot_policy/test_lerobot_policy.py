@@ -25,7 +25,7 @@ from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.methods.lerobot_policy import method
 from playslot_rl.methods.lerobot_policy.actor import ChunkActor
 from playslot_rl.methods.lerobot_policy.method import ACTConfig, ChunkConfig, DiffusionConfig
-from playslot_rl.methods.lerobot_policy.policy import PAD, ChunkPolicy, chunk_policy
+from playslot_rl.methods.lerobot_policy.policy import PAD, ChunkPolicy, Observation, chunk_policy
 from playslot_rl.methods.lerobot_policy.training import Chunks, _optimizer, chunked
 from playslot_rl.methods.resnet_oracle.network import load_trunk
 from playslot_rl.seeds.draws import derived_seed
@@ -70,7 +70,7 @@ def made(name: str, *more: str, state: int = 0) -> tuple[ExperimentConfig, Any, 
     config = compose(["preset=smoke", "env=button_press", *more])
     own = getattr(config.baselines, name)
     torch.manual_seed(0)
-    policy = chunk_policy(own, 64, 4, own.sized(8), state)
+    policy = chunk_policy(own, config.env, own.sized(8), state)
     policy.give(torch.rand(20, 4) * 2 - 1, torch.rand(20, state) if state else None)
     return config, own, policy
 
@@ -138,7 +138,7 @@ def test_rows_and_losses_are_those_of_lerobots_reader_and_processors(name: str, 
     torch.manual_seed(3)
     rows = torch.tensor(whole)
     states = None if found.states is None else found.states[rows]
-    got = policy.loss(found.frames.plain(rows), found.actions[rows], found.pad[rows], states)
+    got = policy.loss(Observation(found.frames.plain(rows), states), found.actions[rows], found.pad[rows])
     torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -272,7 +272,7 @@ def test_every_task_and_preset_has_sizes_that_fit(env: str, preset: str) -> None
     for name in NAMES:
         own = getattr(config.baselines, name)
         with torch.device("meta"):
-            policy = chunk_policy(own, config.env.image_size, config.env.action_dim, own.sized(config.env.max_steps))
+            policy = chunk_policy(own, config.env, own.sized(config.env.max_steps))
         assert 1 <= policy.executed <= policy.chunk <= 20
 
 
