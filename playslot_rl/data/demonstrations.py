@@ -27,7 +27,7 @@ from playslot_rl.data.cache import note_read
 from playslot_rl.data.neighbours import in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.tasks import told_tasks
-from playslot_rl.data.views import drawn_demonstrations, episode_range, first_demonstrations
+from playslot_rl.data.views import acting_first, drawn_demonstrations, episode_range, first_demonstrations
 from playslot_rl.errors import DataError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_range import ActionRange
@@ -119,15 +119,16 @@ class DemonstrationSplit:
 
 
 def split_demonstrations(
-    source: EpisodeFrames, demos: int | None, kept: int, measured: int, draw: int | None = None
+    source: EpisodeFrames, demos: int | None, kept: int, measured: int, draw: int | None = None, acted: bool = False
 ) -> DemonstrationSplit:
-    """Train on the first demonstrations, and measure on the last ones.
+    """Train on the first demonstrations, those with actions before those without, and measure on the last ones.
 
     Args:
         demos: how many are trained on; None for all but the last `kept`.
         measured: at most so many beyond those that are trained on measure, if more than `kept`.
         draw: seed that decides which are the first ones, the same whatever `demos`; None keeps their order. The last
             ones, which may measure (half of the set at most, beyond `kept`), are not drawn.
+        acted: the first ones of those with actions, as who learns from all demonstrations is shown them.
 
     Raises:
         DataError: there are fewer episodes than `demos`, or none that is not kept.
@@ -138,8 +139,10 @@ def split_demonstrations(
     parsed = first_demonstrations(source, max(free, trained.recordings))
     last = max(kept, measured) if draw is None else count - drawn_among(count, kept, measured)
     rest = count - min(last, count - trained.recordings)
-    if draw is not None:
-        trained = first_demonstrations(drawn_demonstrations(source, draw, count - last), trained.recordings)
+    drawn = source if draw is None else drawn_demonstrations(source, draw, count - last)
+    if acted:
+        drawn = acting_first(drawn, drawn_among(count, kept, measured))
+    trained = acting_first(first_demonstrations(drawn, trained.recordings))
     usable = bool((source.lengths[source.numbers >= rest] >= 2).any())
     return DemonstrationSplit(trained, parsed, episode_range(source, rest, count) if usable else None)
 
@@ -288,8 +291,8 @@ def require_finite(demos: DemonstrationSplit, labelled: int | None = None) -> No
             some = len(np.unique(moves.episode[acted]))
             raise DataError(
                 f"{source.unlabelled}: got no actions, expected some in all {len(np.unique(moves.episode[read]))} "
-                f"demonstrations whose actions are learned: {some} have any; name theirs first in data.demos, and set "
-                f"demos={some}, or behaviour.labelled_demos={some} or less and behaviour.oracle=false"
+                f"demonstrations whose actions are learned: {some} have any; name those alone in data.demos, or set "
+                f"behaviour.labelled_demos={some} or less and behaviour.oracle=false"
             )
         read &= acted
         bad = int((~np.isfinite(actions[read])).any(axis=1).sum())

@@ -373,6 +373,15 @@ def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = N
     return replace(drawn, fingerprint=text_hash(f"{first.fingerprint}/{how}"))
 
 
+def acting_first(source: EpisodeFrames, among: int | None = None) -> EpisodeFrames:
+    """The same episodes, of the first `among` of them (None: all) those with actions before those without."""
+    silent = source.silent[np.unique(source.numbers, return_index=True)[1]][:among]
+    order = np.argsort(silent, kind="stable")
+    if (order[1:] > order[:-1]).all():
+        return source
+    return chosen_episodes(source, np.concatenate((order, np.arange(len(order), source.recordings))), "acting first")
+
+
 def split_tested(source: EpisodeFrames, fraction: float) -> tuple[EpisodeFrames, EpisodeFrames]:
     """The episodes that are trained on, and a fraction, two at least, that is kept for a test, the same for every seed.
 

@@ -119,7 +119,8 @@ class StageRecord:
                 f"data.demos={self.roots}: got weights, expected none: a policy is cloned from every transition of "
                 "its demonstrations alike; leave the weights out"
             )
-        found = split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw)
+        acted = self.spec.data == "labelled"
+        found = split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw, acted)
         require_tasks(found.trained, config.env)
         say_untaught(found.trained, config.env, config.behaviour.labelled_demos if self.spec.some_labelled else None)
         if found.trained.limits is not None:  # a robot's own actions
@@ -151,7 +152,7 @@ class StageRecord:
         if not self.spec.sees_labels(self.config):
             return None
         config = replace(self.config, demos=self.config.behaviour.labelled_demos)
-        return replace(self, spec=replace(self.spec, data="demos"), config=config).demos.trained
+        return replace(self, spec=replace(self.spec, data="labelled"), config=config).demos.trained
 
     @property
     def labels(self) -> str:

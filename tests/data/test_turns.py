@@ -13,11 +13,12 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.config.weights import data_roots
 from playslot_rl.data import videos
-from playslot_rl.data.demonstrations import split_demonstrations
+from playslot_rl.data.demonstrations import require_finite, split_demonstrations
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.turns import turns
 from playslot_rl.data.views import by_turns, concatenate, recorded_tasks, views_of_one
 from playslot_rl.data.weighted import weighted
+from playslot_rl.errors import DataError
 from playslot_rl.evaluation.held_out import trained_on
 from playslot_rl.training.taught import taught
 
@@ -63,6 +64,12 @@ def sets(cameras: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
 def of_tasks(source: EpisodeFrames) -> dict[str, int]:
     named = {said: name for name, said in SENTENCES.items()}
     return dict(Counter(named[task] for task in recorded_tasks(source)))
+
+
+def in_order(source: EpisodeFrames) -> list[str]:
+    """Where each recorded episode is from."""
+    assert source.origins is not None
+    return [str(origin) for origin in source.origins[np.unique(source.numbers, return_index=True)[1]]]
 
 
 @pytest.mark.parametrize("draw", [None, 0, 1, 2])
@@ -162,3 +169,29 @@ def test_first_and_last_ones_are_in_proportion(counts: tuple[int, ...]) -> None:
     for i in range(len(counts)):
         own = [number for number in order.tolist() if tasks[number] == str(i)]
         assert own == sorted(own), "of one task they stay in their order"
+
+
+@pytest.mark.parametrize("draw", [None, 0, 1])
+def test_labelled_demonstrations_are_those_with_actions_and_of_each_task_that_has_some(
+    sets: str, cameras: int, draw: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of `push` there are videos alone; they are cloned, held out, and never labelled."""
+
+    def opened(_: ExperimentConfig, roots: str) -> EpisodeFrames:
+        named = [recorded(Path(root.path).name, cameras) for root in data_roots(roots)]
+        return weighted([replace(s, actions=None) if s.name == "push" else s for s in named], [None] * len(named))
+
+    monkeypatch.setattr(videos, "open_configured", opened)
+    config = compose(["env=metaworld", f"env.task={'+'.join(TASKS)}", f"data.demos={sets}"])
+    source = videos.open_videos(config, sets, "train-policy")
+    every = split_demonstrations(source, None, 5, 0, draw)
+    assert every.held_out is not None
+    assert of_tasks(every.trained) == {"reach": 10, "push": 10, "pick-place": 5}
+    assert of_tasks(every.held_out) == {"reach": 2, "push": 2, "pick-place": 1}
+    few = split_demonstrations(source, 6, 5, 0, draw, acted=True).trained
+    assert of_tasks(few) == {"reach": 4, "pick-place": 2}
+    assert in_order(few) == in_order(every.trained)[:6]
+    for labelled in (1, 6, 15):
+        require_finite(every, labelled)
+    with pytest.raises(DataError, match=r"^push: got no actions, expected some in all 16 .*: 15 have any; name those"):
+        require_finite(every, 16)
