@@ -114,6 +114,12 @@ class EpisodeFrames:
         return np.arange(self.episodes) if self.recorded is None else self.recorded
 
     @property
+    def first_views(self) -> npt.NDArray[np.int64]:
+        """Which episode shows each recorded one first, int64 (R,)."""
+        found: npt.NDArray[np.int64] = np.unique(self.numbers, return_index=True)[1]
+        return found
+
+    @property
     def silent(self) -> npt.NDArray[np.bool_]:
         """Which episodes have no actions though others have some, bool (E,)."""
         if self.actions is None or not self.unlabelled:

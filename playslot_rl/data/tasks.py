@@ -64,5 +64,5 @@ def say_untaught(source: EpisodeFrames, env: EnvConfig, labelled: int | None) ->
         some = repr(missing[0]) + (f" and {len(missing) - 1} others" if missing[1:] else "")
         say_once(
             f"note: {source.name}: got no labelled demonstration{number} of {some} of env.task={env.task}, whose "
-            "actions are a guess: label more (behaviour.labelled_demos, or demos) or record some"
+            "actions other tasks' labels alone teach: label more (behaviour.labelled_demos, or demos) or record some"
         )

@@ -174,8 +174,7 @@ def by_turns(source: EpisodeFrames) -> EpisodeFrames:
 
 def recorded_tasks(source: EpisodeFrames) -> list[str]:
     """What is to be done in each recorded episode (R); empty where it was not read."""
-    first = np.unique(source.numbers, return_index=True)[1]
-    return [] if source.tasks is None else [str(task) for task in source.tasks[first]]
+    return [] if source.tasks is None else [str(task) for task in source.tasks[source.first_views]]
 
 
 def views_of_one(views: Sequence[EpisodeFrames]) -> EpisodeFrames:
@@ -375,8 +374,7 @@ def drawn_demonstrations(source: EpisodeFrames, seed: int, among: int | None = N
 
 def acting_first(source: EpisodeFrames, among: int | None = None) -> EpisodeFrames:
     """The same episodes, of the first `among` of them (None: all) those with actions before those without."""
-    silent = source.silent[np.unique(source.numbers, return_index=True)[1]][:among]
-    order = np.argsort(silent, kind="stable")
+    order = np.argsort(source.silent[source.first_views][:among], kind="stable")
     if (order[1:] > order[:-1]).all():
         return source
     return chosen_episodes(source, np.concatenate((order, np.arange(len(order), source.recordings))), "acting first")

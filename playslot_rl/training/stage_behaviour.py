@@ -194,15 +194,20 @@ class DecoderStage(RegressionStage):
         horizon: int | None = None,
     ) -> DecoderStage | None:
         """A copy of the decoder on the first half of the labelled demonstrations, measured on the second: see
-        `slots_pay`. None where a half has no rows: one demonstration, or trimming, leaves nothing to measure on."""
+        `slots_pay`. Where it will decode tasks of which none is labelled, the halves are of other tasks: what slots
+        tell in one may mislead in another. None where a half has no rows: one demonstration or task, or trimming,
+        leaves nothing to measure on."""
         labelled = demos.take(demos.labelled(config.labelled_demos))
-        half = (config.labelled_demos + 1) // 2
-        second = labelled.episode >= half
+        second = labelled.episode >= (config.labelled_demos + 1) // 2
+        if demos.task is not None and labelled.task is not None:
+            taught = labelled.task.unique()
+            if len(taught) < len(demos.task.unique()):
+                second = torch.isin(labelled.task[:, 0], taught[(len(taught) + 1) // 2 :])
         if second.all() or not second.any():
             return None
         tried = deepcopy(decoder)
         tried.trusts_slots.fill_(True)
-        return cls(tried, policy, labelled, replace(config, labelled_demos=half), labelled.take(second), horizon)
+        return cls(tried, policy, labelled.take(~second), config, labelled.take(second), horizon)
 
     def slots_pay(self) -> bool:
         """Whether the actions' mean absolute error on `held_out` is clearly (`PAYS`) less with slots than without."""

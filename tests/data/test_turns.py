@@ -69,7 +69,7 @@ def of_tasks(source: EpisodeFrames) -> dict[str, int]:
 def in_order(source: EpisodeFrames) -> list[str]:
     """Where each recorded episode is from."""
     assert source.origins is not None
-    return [str(origin) for origin in source.origins[np.unique(source.numbers, return_index=True)[1]]]
+    return [str(origin) for origin in source.origins[source.first_views]]
 
 
 @pytest.mark.parametrize("draw", [None, 0, 1, 2])

@@ -97,6 +97,24 @@ def test_slots_are_trusted_where_they_pay(source: str, pays: bool) -> None:
     assert trial.slots_pay() is pays
 
 
+@pytest.mark.parametrize("labels_of_all", [True, False])
+def test_slots_are_tried_on_other_tasks_where_some_have_no_label(labels_of_all: bool) -> None:
+    """The six labelled demonstrations are of tasks 0 and 1 by turns, the others of 1, or of 2."""
+    policy, decoder = networks()
+    demos = demonstrations("slots")
+    task = torch.where(demos.episode < 6, demos.episode % 2, torch.full_like(demos.episode, 2 - labels_of_all))
+    told = replace(demos, task=task[:, None])
+    trial = DecoderStage.trial(decoder, policy, told, replace(CONFIG, decoder_inputs="inverse_dynamics"))
+    assert trial is not None
+    assert demos.actions is not None
+    labelled = demos.episode < 6
+    second = demos.episode >= 3 if labels_of_all else task == 1
+    assert torch.equal(trial.targets, demos.actions[labelled & ~second])
+    assert torch.equal(trial.checks["unexplained_held_out"][1], demos.actions[labelled & second])
+    alone = replace(told, task=torch.where(labelled, 0, 2)[:, None])
+    assert DecoderStage.trial(decoder, policy, alone, CONFIG) is None, "one task cannot tell"
+
+
 def test_a_decoder_that_does_not_trust_slots_acts_without_them() -> None:
     _, decoder = networks()
     decoder.eval()

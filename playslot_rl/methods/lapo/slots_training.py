@@ -17,11 +17,10 @@ from torch import Tensor
 
 from playslot_rl.config import StageConfig
 from playslot_rl.data.cache import Cache
-from playslot_rl.data.demonstrations import Transitions, moving_slots, real_actions, transitions
+from playslot_rl.data.demonstrations import Transitions
 from playslot_rl.data.neighbours import Ends
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.data.tasks import told_tasks
 from playslot_rl.losses.behaviour import BehaviourLoss
 from playslot_rl.methods.cloning import LatentCloning, Seen, cloning, inferred
 from playslot_rl.methods.lapo.slots import SlotForward, SlotInverse
@@ -30,7 +29,7 @@ from playslot_rl.methods.lapo.training import TWO, LAPOModelStage, on_pairs
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import global_seed
-from playslot_rl.training.demonstrated import demonstration_views
+from playslot_rl.training.demonstrated import demonstration_views, moves
 from playslot_rl.training.record import StageRecord
 from playslot_rl.training.run_stage import Training
 from playslot_rl.training.stage_regression import PairedInputs, TensorInputs
@@ -81,19 +80,14 @@ class LAPOSlotsBehaviour(LatentCloning):
         return BehaviourLoss(self.policy, self.loss)
 
     def _seen(self, source: EpisodeFrames, shift: int = 0) -> Seen:  # noqa: ARG002
-        own, views = self.config.behaviour, self.views if source is self.whole else self.others
-        moves = [moving_slots(transitions(v), self.parsed[id(v)], own.trim, own.trim_margin) for v in views]
-        slots = [torch.from_numpy(self.parsed[id(v)][m.rows]) for v, m in zip(views, moves, strict=True)]
-        latents = [self.infer(v, m) for v, m in zip(views, moves, strict=True)]
-        width = self.config.env.action_dim
-        actions = [real_actions(v, m.rows, width) for v, m in zip(views, moves, strict=True)]
-        parts = ([getattr(m, name) for m in moves] for name in ("rows", "episode", "step"))
+        views = self.views if source is self.whole else self.others
+        found = moves([(view, self.parsed[id(view)]) for view in views], self.config, self.device)
+        latents = [self.infer(view, moving) for view, moving in zip(views, found.found, strict=True)]
+        parts = ([getattr(moving, name) for moving in found.found] for name in ("rows", "episode", "step"))
         rows, episode, step = map(np.concatenate, parts)
-        joined = Transitions(rows, episode, step, moves[0].lengths)
-        told = [told_tasks(v, m, self.config.env) for v, m in zip(views, moves, strict=True)]
-        task = torch.cat([one for one in told if one is not None]).to(self.device) if None not in told else None
-        inputs = PairedInputs.told(TensorInputs(torch.cat(slots).to(self.device), self.noise, "policy_noise"), task)
-        return Seen(inputs, torch.cat(latents), torch.cat(actions).to(self.device), joined, task)
+        joined = Transitions(rows, episode, step, found.found[0].lengths)
+        inputs = PairedInputs.told(TensorInputs(found.slots, self.noise, "policy_noise"), found.task)
+        return Seen(inputs, torch.cat(latents), found.actions, joined, found.task)
 
 
 def policy(record: StageRecord) -> Training:
