@@ -19,13 +19,7 @@ from playslot_rl.acting.belief import BeliefActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
-from playslot_rl.world_model import (
-    Agent,
-    action_decoder_module,
-    latent_policy_module,
-    observed_keys,
-    oracle_module,
-)
+from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, observed_keys, oracle_module
 
 
 def playslot_actor(agent: Agent) -> SlotActor:

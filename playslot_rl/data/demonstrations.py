@@ -137,11 +137,12 @@ def split_demonstrations(
     free = free_demonstrations(count, kept)
     trained = first_demonstrations(source, free if demos is None else demos)
     parsed = first_demonstrations(source, max(free, trained.recordings))
-    last = max(kept, measured) if draw is None else count - drawn_among(count, kept, measured)
+    among = drawn_among(count, kept, measured)
+    last = max(kept, measured) if draw is None else count - among
     rest = count - min(last, count - trained.recordings)
-    drawn = source if draw is None else drawn_demonstrations(source, draw, count - last)
+    drawn = source if draw is None else drawn_demonstrations(source, draw, among)
     if acted:
-        drawn = acting_first(drawn, drawn_among(count, kept, measured))
+        drawn = acting_first(drawn, among)
     trained = acting_first(first_demonstrations(drawn, trained.recordings))
     usable = bool((source.lengths[source.numbers >= rest] >= 2).any())
     return DemonstrationSplit(trained, parsed, episode_range(source, rest, count) if usable else None)

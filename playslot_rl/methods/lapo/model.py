@@ -98,12 +98,12 @@ class EncoderMLP(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return self.out(self.hidden(x))
 
-    def hidden(self, x: Tensor, start: Tensor | None = None, shift: Tensor | float = 0.0) -> Tensor:
+    def hidden(self, x: Tensor, start: Tensor | None = None, shift: Tensor | None = None) -> Tensor:
         """(B, 3 F, H, W) to the hidden layer, (B, hidden), after its ReLU, to which `shift` (B, hidden) is added before
         it; `start` as in `ConvEncoder`.
         """
         h: Tensor = self.mlp[0](self.encoder(x, start)[-1].flatten(1))
-        return F.relu(h + shift)
+        return F.relu(h if shift is None else h + shift)
 
     def out(self, hidden: Tensor) -> Tensor:
         """(B, hidden) to (B, Z)."""
