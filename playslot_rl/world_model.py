@@ -19,7 +19,7 @@ from playslot_rl.errors import ConfigError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.inverse_dynamics import InverseDynamics
-from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.modules.policy import LatentPolicy, told_keys
 from playslot_rl.modules.predictors import build_predictor
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.runtime.captured import Captured
@@ -221,12 +221,12 @@ def dynamics_module(world_model: WorldModel) -> TensorDictSequential:
 
 
 def observed_keys(policy: object, observation: str = keys.SLOTS) -> list[str]:
-    """What a policy reads: its observation, and TASK where it is told."""
-    return [observation, *([keys.TASK] if getattr(policy, "tasks", 0) else [])]
+    """What a policy reads: its observation, and what it is told."""
+    return [observation, *told_keys(policy)]
 
 
 def latent_policy_module(policy: nn.Module) -> TensorDictModule:
-    """SLOTS (..., N, D), and TASK where it is told, to LATENT_ACTION (..., [N,] Z). The same module acts in the
+    """SLOTS (..., N, D), and what it is told, to LATENT_ACTION (..., [N,] Z). The same module acts in the
     simulator and in imagination.
     """
     return TensorDictModule(policy, in_keys=observed_keys(policy), out_keys=[keys.LATENT_ACTION])
@@ -239,7 +239,7 @@ def action_decoder_module(action_decoder: ActionDecoder, state: str = keys.SLOTS
 
 
 def oracle_module(oracle: nn.Module, observation: str = keys.SLOTS) -> TensorDictSequential:
-    """SLOTS (..., N, D), or another observation, and TASK where it is told, to ACTION (..., A), clamped to [-1, 1]."""
+    """SLOTS (..., N, D), or another observation, and what it is told, to ACTION (..., A), clamped to [-1, 1]."""
     return TensorDictSequential(
         TensorDictModule(oracle, in_keys=observed_keys(oracle, observation), out_keys=[keys.ACTION]),
         TensorDictModule(nn.Hardtanh(), in_keys=[keys.ACTION], out_keys=[keys.ACTION]),

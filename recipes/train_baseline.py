@@ -32,7 +32,7 @@ def main(config: ExperimentConfig) -> None:
         )
     if method.acts and config.env.name not in RECORDED:
         gym_id(config.env.name)
-    require_told(config.env, method.name)
+    require_told(config, method.name)
     from playslot_rl.methods.training import train
     from playslot_rl.visualization.charts import draw_curve
 

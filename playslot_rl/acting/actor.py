@@ -8,7 +8,7 @@ Shapes: n episodes side by side, T agent steps, N slots, D slot width, A action 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -19,14 +19,20 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config.env import in_turn
+from playslot_rl.errors import ConfigError
+from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.action_range import ActionRange, range_of
-from playslot_rl.modules.policy import Decides
+from playslot_rl.modules.policy import Decides, LatentPolicy
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.world_model import action_decoder_module, frame_parser_module, observed_keys
 
 RANDOM_STREAM: Final = 7
 """Keeps random actions apart from the environment's own stream of the same seed."""
+LOOKS: Final = 2
+"""Times that a goal image is shown to SAVi, as `plan.looks`."""
+Goals = Callable[[Sequence[int]], Tensor]
+"""Seeds of n episodes to their goal images (n, 3, H, W) uint8 [0, 255]."""
 
 
 class Actor(TensorDictModuleBase):
@@ -35,18 +41,24 @@ class Actor(TensorDictModuleBase):
     Reads PIXELS (n, 3, H, W), uint8 [0, 255] or float [0, 1], or what `reads` names, and the keys of its `memory`;
     writes ACTION (n, A), in [-1, 1] but for what `executed` clips, and the memory's keys anew. In evaluation mode it is
     a function of these inputs, so that episodes in a batch do not touch each other. Where there are several `tasks` its
-    memory has TASK (n, 1), which of them an episode is of, by its seed.
+    memory has TASK (n, 1), which of them an episode is of, by its seed; where it is shown goals GOAL_PIXELS
+    (n, 3, H, W), as `goals` gives them.
 
     Attributes:
+        goals: of episodes, for who is shown one; whoever runs it sets them.
         looks: at which frames: `always`, `first` (it never sees what its actions did) or `never`. Frames that nobody
             looks at need not be drawn.
     """
 
     looks: Literal["always", "first", "never"] = "always"
+    goals: Goals | None = None
 
-    def __init__(self, memory: Sequence[str] = (), reads: Sequence[str] = (keys.PIXELS,), tasks: int = 0) -> None:
+    def __init__(
+        self, memory: Sequence[str] = (), reads: Sequence[str] = (keys.PIXELS,), tasks: int = 0, goal: bool = False
+    ) -> None:
         super().__init__()
-        self.tasks, self.memory_keys = tasks, (*memory, *([keys.TASK] if tasks else []))
+        self.tasks, self.shown_goals = tasks, goal
+        self.memory_keys = (*memory, *([keys.TASK] if tasks else []), *([keys.GOAL_PIXELS] if goal else []))
         self.in_keys = [*reads, *self.memory_keys]
         self.out_keys = [keys.ACTION, *(key for key in self.memory_keys if key != keys.ACTION)]
 
@@ -69,7 +81,15 @@ class Actor(TensorDictModuleBase):
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""
-        return TensorDict(told(seeds, self.tasks), [len(seeds)], device=self.device)
+        memory = TensorDict(told(seeds, self.tasks), [len(seeds)], device=self.device)
+        if self.shown_goals:
+            if self.goals is None:
+                raise ConfigError(
+                    "model.policy.goal: got no goal images, expected some for a policy that is shown them: use "
+                    "evaluate, or set the actor's `goals`"
+                )
+            memory[keys.GOAL_PIXELS] = self.goals(seeds)
+        return memory
 
     @abstractmethod
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -95,15 +115,32 @@ def told(seeds: Sequence[int], tasks: int) -> dict[str, Tensor]:
     return {keys.TASK: torch.tensor([[in_turn(seed, tasks)] for seed in seeds])} if tasks else {}
 
 
+@torch.no_grad()
+def goal_slots(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tensor:
+    """Slots (n, N, D) of goal images (n, 3, H, W) as SAVi would track them: parsed as the frame after the first one,
+    with the state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones. The
+    image is shown `looks` times; a far goal may take the slots more than one correction to reach.
+    """
+    clip = normalise(goal)[:, None].expand(-1, looks, -1, -1, -1)
+    slots: Tensor = savi(clip, state)[0]
+    return slots[:, -1]
+
+
 class SlotActor(Actor):
     """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads.
 
     Note: initial slots that are sampled (SAVi with `initial: gaussian`) come from one generator, which `reset` seeds
     with the first episode's seed; learned ones draw nothing.
+
+    Args:
+        policy: which of the heads may be told something: GOAL_SLOTS (n, N, D) are found at an episode's first frame.
     """
 
-    def __init__(self, savi: SAVi, *heads: TensorDictModuleBase, memory: Sequence[str] = (), tasks: int = 0) -> None:
-        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *memory), tasks=tasks)
+    def __init__(
+        self, savi: SAVi, *heads: TensorDictModuleBase, policy: LatentPolicy, memory: Sequence[str] = ()
+    ) -> None:
+        own = [keys.GOAL_SLOTS] if policy.goal else []
+        super().__init__((keys.SLOT_STATE, keys.SLOT_AGE, *own, *memory), tasks=policy.tasks, goal=policy.goal)
         self._slots = (savi.config.n_slots, savi.config.slot_dim)
         self.parser = frame_parser_module(savi)
         self.heads = TensorDictSequential(*heads)
@@ -114,10 +151,21 @@ class SlotActor(Actor):
         memory = super().reset(seeds)
         memory[keys.SLOT_STATE] = torch.zeros(len(seeds), *self._slots)
         memory[keys.SLOT_AGE] = torch.zeros(len(seeds), 1, dtype=torch.long)
+        if self.shown_goals:
+            memory[keys.GOAL_SLOTS] = torch.zeros(len(seeds), *self._slots)
         return memory
 
+    def see(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """SLOTS of the present frame, and of the goal image where there is one and the frame is an episode's first."""
+        seen: TensorDictBase = self.parser(tensordict)
+        fresh = seen.get(keys.SLOT_AGE).squeeze(-1) == 1
+        if self.shown_goals and bool(fresh.any()):
+            state, goal = seen.get(keys.SLOT_STATE)[fresh], seen.get(keys.GOAL_PIXELS)[fresh]
+            put_rows(seen, fresh, {keys.GOAL_SLOTS: goal_slots(self.parser.module.savi, state, goal, LOOKS)})
+        return seen
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self.heads(self.parser(tensordict))
+        return self.heads(self.see(tensordict))
 
 
 class ReactiveActor(Actor):
@@ -168,9 +216,15 @@ class PlannedActor(Actor):
     looks: Literal["always", "first", "never"] = "never"
 
     def __init__(
-        self, steps: int, action_dim: int, memory: Sequence[str] = (), reads: Sequence[str] = (), tasks: int = 0
+        self,
+        steps: int,
+        action_dim: int,
+        memory: Sequence[str] = (),
+        reads: Sequence[str] = (),
+        tasks: int = 0,
+        goal: bool = False,
     ) -> None:
-        super().__init__((keys.PLANNED_ACTIONS, keys.STEP_COUNT, *memory), reads, tasks)
+        super().__init__((keys.PLANNED_ACTIONS, keys.STEP_COUNT, *memory), reads, tasks, goal)
         self.steps, self.action_dim = steps, action_dim
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:

@@ -14,11 +14,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import ExpertActor, PlannedActor, SlotActor, put_rows
+from playslot_rl.acting.actor import LOOKS, Actor, ExpertActor, PlannedActor, SlotActor, goal_slots, put_rows
 from playslot_rl.acting.belief import BeliefActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
+from playslot_rl.modules.policy import told_keys
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, observed_keys, oracle_module
 
 
@@ -27,14 +28,14 @@ def playslot_actor(agent: Agent) -> SlotActor:
     if agent.policy.gain < 1:
         return BeliefActor(agent)
     heads = (latent_policy_module(agent.policy), action_decoder_module(agent.action_decoder))
-    return SlotActor(agent.world_model.savi, *heads, tasks=agent.policy.tasks)
+    return SlotActor(agent.world_model.savi, *heads, policy=agent.policy)
 
 
 def oracle_actor(agent: Agent) -> SlotActor:
     """The slot oracle beside the agent, which gives real actions; a ValueError where there is none."""
     if agent.oracle is None:
         raise ValueError("oracle_actor: got an agent without a slot oracle, expected one trained with behaviour.oracle")
-    return SlotActor(agent.world_model.savi, oracle_module(agent.oracle), tasks=agent.oracle.tasks)
+    return SlotActor(agent.world_model.savi, oracle_module(agent.oracle), policy=agent.oracle)
 
 
 class Imagination(NamedTuple):
@@ -50,17 +51,17 @@ class Imagination(NamedTuple):
 @torch.no_grad()
 def imagine(agent: Agent, first: TensorDictBase, steps: int, generator: torch.Generator | None = None) -> Imagination:
     """Unfold the policy for T steps in latent space: nothing is observed after `first`, SLOTS (E, N, D) or PIXELS
-    (E, 3, H, W) on the agent's device, and TASK (E, 1) where the policy is told.
+    (E, 3, H, W) on the agent's device, and TASK (E, 1) or GOAL_SLOTS (E, N, D) where the policy is told.
 
     The latents are decoded alone: a decoder that reads slots learned from those that it sees when it acts, and imagined
     ones mislead it (docs/notebook/labels.md).
     """
     env = ImaginationEnv(agent.world_model, first.batch_size, generator=generator)
-    state, task = env.reset(first), first.get(keys.TASK, None)
+    state, told = env.reset(first), [first.get(key) for key in told_keys(agent.policy)]
     slots, latents = [state[keys.SLOTS]], list[Tensor]()
     # Not by `env.rollout`, which asks the device after each step whether an episode is over.
     for _ in range(steps):
-        latents.append(agent.policy(slots[-1]) if task is None else agent.policy(slots[-1], task))
+        latents.append(agent.policy(slots[-1], *told))
         state = env.step_mdp(env.step(state.set(keys.LATENT_ACTION, latents[-1])))
         slots.append(state[keys.SLOTS])
     z = torch.stack(latents, 1)
@@ -76,9 +77,9 @@ class ImaginationActor(PlannedActor):
     looks = "first"
 
     def __init__(self, agent: Agent, steps: int) -> None:
-        width, tasks = agent.world_model.env.action_dim, agent.policy.tasks
-        super().__init__(steps, width, (keys.PREDICTED_SLOTS,), (keys.PIXELS,), tasks)
-        self.agent, self._shown = agent, observed_keys(agent.policy, keys.PIXELS)
+        width, policy = agent.world_model.env.action_dim, agent.policy
+        super().__init__(steps, width, (keys.PREDICTED_SLOTS,), (keys.PIXELS,), policy.tasks, policy.goal)
+        self.agent = agent
         self._generator: torch.Generator | None = None
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
@@ -93,10 +94,19 @@ class ImaginationActor(PlannedActor):
         """Imagine the whole episode at its first frame; then the step's action."""
         fresh = tensordict.get(keys.STEP_COUNT).squeeze(-1) == 0
         if bool(fresh.any()):
-            imagined = imagine(self.agent, tensordict.select(*self._shown)[fresh], self.steps, self._generator)
+            imagined = imagine(self.agent, self._shown(tensordict[fresh]), self.steps, self._generator)
             found = {keys.PLANNED_ACTIONS: imagined.actions, keys.PREDICTED_SLOTS: imagined.slots}
             put_rows(tensordict, fresh, found)
         return super().forward(tensordict)
+
+    def _shown(self, first: TensorDictBase) -> TensorDictBase:
+        """What a rollout begins with."""
+        if not self.shown_goals:
+            return first.select(*observed_keys(self.agent.policy, keys.PIXELS))
+        savi = self.agent.world_model.savi
+        slots, state = savi(normalise(first[keys.PIXELS])[:, None], generator=self._generator)
+        goal = goal_slots(savi, state, first[keys.GOAL_PIXELS], LOOKS)
+        return TensorDict({keys.SLOTS: slots[:, 0], keys.GOAL_SLOTS: goal}, first.batch_size)
 
 
 def perform(pool: TaskPool, seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -111,6 +121,14 @@ def perform(pool: TaskPool, seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
 
     frames, _ = record(pool, ExpertActor(), seeds, note)
     return torch.from_numpy(frames).movedim(-1, -3), actions.clamp(-1, 1)
+
+
+def show_goals(actor: Actor | None, stage: TaskPool) -> None:
+    """Have an actor that is shown goals, and has none, reach those in which the scripted expert ends the same
+    episodes; it plays them on a stage of its own, while the actor's environments wait at their first frames.
+    """
+    if actor is not None and actor.shown_goals and actor.goals is None:
+        actor.goals = lambda seeds: perform(stage, seeds)[0][:, -1]
 
 
 class ReplayActor(PlannedActor):

@@ -30,9 +30,8 @@ class BeliefActor(SlotActor):
     """PlaySlot's policy on beliefs, of gain `agent.policy.gain`; a decoder that reads slots reads the parsed ones."""
 
     def __init__(self, agent: Agent) -> None:
-        super().__init__(
-            agent.world_model.savi, action_decoder_module(agent.action_decoder), memory=PAST, tasks=agent.policy.tasks
-        )
+        decoder = action_decoder_module(agent.action_decoder)
+        super().__init__(agent.world_model.savi, decoder, policy=agent.policy, memory=PAST)
         self.policy, self.dynamics = latent_policy_module(agent.policy), dynamics_module(agent.world_model)
         self.gain = agent.policy.gain
         self._context, self._latent = agent.world_model.config.predictor.context, agent.world_model.latent_shape
@@ -46,7 +45,7 @@ class BeliefActor(SlotActor):
         return memory
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen = self.parser(tensordict)
+        seen = self.see(tensordict)
         parsed, moved = seen[keys.SLOTS], seen.copy()
         first = moved[keys.HISTORY_LENGTH] == 0
         moved[keys.HISTORY_LENGTH] = moved[keys.HISTORY_LENGTH].clamp(min=1)  # of a first frame nothing is predicted

@@ -7,23 +7,20 @@ width, H W image height and width.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, put_rows
+from playslot_rl.acting.actor import Actor, Goals, goal_slots, put_rows
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.planners import Cost, Planner, Search, SearchSize, latent_statistics, shifted
-from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance, parse_goal
+from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.seeds.draws import step_generator
 from playslot_rl.world_model import Agent, action_decoder_module, frame_parser_module
-
-Goals = Callable[[Sequence[int]], Tensor]
-"""Seeds of n episodes to their goal images (n, 3, H, W) uint8 [0, 255]."""
 
 
 class PlanningActor(Actor):
@@ -57,7 +54,7 @@ class PlanningActor(Actor):
             keys.PREDICTED_SLOTS: (size.horizon + 1, *slots),
             **dict.fromkeys((keys.PLAN_COST, keys.PROPOSAL_COST, keys.PLAN_SECONDS), (1,)),
         }
-        super().__init__((*zeros, keys.SLOT_AGE, keys.STEP_COUNT, keys.EPISODE_SEED, keys.GOAL_PIXELS))
+        super().__init__((*zeros, keys.SLOT_AGE, keys.STEP_COUNT, keys.EPISODE_SEED), goal=True)
         self.agent, self.planner, self.config, self.size = agent, planner, plan, size
         self.goals, self.policy, self.seed, self.frames_seen, self._zeros = goals, policy, seed, seen, zeros
         self.whitening = latent_statistics(agent)
@@ -72,7 +69,6 @@ class PlanningActor(Actor):
         for key in (keys.SLOT_AGE, keys.STEP_COUNT):
             memory[key] = torch.zeros(n, 1, dtype=torch.long)
         memory[keys.EPISODE_SEED] = torch.tensor(seeds)[:, None]
-        memory[keys.GOAL_PIXELS] = self.goals(seeds)
         return memory
 
     @torch.no_grad()
@@ -86,7 +82,7 @@ class PlanningActor(Actor):
         if 0 in steps:
             fresh = step.squeeze(-1) == 0
             state, goal = tensordict.get(keys.SLOT_STATE), tensordict.get(keys.GOAL_PIXELS)
-            parsed = parse_goal(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
+            parsed = goal_slots(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
             put_rows(tensordict, fresh, {keys.GOAL_SLOTS: parsed})
         for row, at in enumerate(steps):
             if at % self.size.every == 0:
@@ -100,7 +96,7 @@ class PlanningActor(Actor):
         """Renew the plan of one episode in the tensordict."""
         begin, seed = time.perf_counter(), int(tensordict.get(keys.EPISODE_SEED)[row])
         cost = self._cost(tensordict, row, step)
-        proposal = self._proposal(cost.slots[-1])
+        proposal = self._proposal(cost.slots[-1], tensordict.get(keys.GOAL_SLOTS)[row])
         starts = proposal
         if step:
             last = tensordict.get(keys.PLANNED_LATENTS)[row]
@@ -130,13 +126,16 @@ class PlanningActor(Actor):
         distance = goal_distance(self.agent, self.config.cost, goal, image, self.config.match)
         return GoalCost(model, seen, past, distance, self.config.along)
 
-    def _proposal(self, slots: Tensor) -> Tensor:
-        """The policy's plan from slots (N, D): latent actions (1, H, Z), or none (0, H, Z)."""
+    def _proposal(self, slots: Tensor, goal: Tensor) -> Tensor:
+        """The policy's plan from slots (N, D) to those of the goal: latent actions (1, H, Z), or none (0, H, Z)."""
         if not self.policy:
             return slots.new_empty(0, self.size.horizon, *self.agent.world_model.latent_shape)
-        return policy_plan(self.agent, slots, self.size.horizon)
+        return policy_plan(self.agent, slots, self.size.horizon, goal)
 
 
-def policy_plan(agent: Agent, slots: Tensor, horizon: int) -> Tensor:
-    """What the latent policy would do from slots (N, D), imagined: latent actions (1, H, Z)."""
-    return imagine(agent, TensorDict({keys.SLOTS: slots[None]}, [1]), horizon).latents
+def policy_plan(agent: Agent, slots: Tensor, horizon: int, goal: Tensor | None = None) -> Tensor:
+    """What the latent policy would do from slots (N, D), imagined, to those of a goal where it is shown one: latent
+    actions (1, H, Z).
+    """
+    first = {keys.SLOTS: slots[None], **({} if goal is None else {keys.GOAL_SLOTS: goal[None]})}
+    return imagine(agent, TensorDict(first, [1]), horizon).latents

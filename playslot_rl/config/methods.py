@@ -7,12 +7,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from playslot_rl.config import plugins
-from playslot_rl.config.env import EnvConfig
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.errors import ConfigError
+
+if TYPE_CHECKING:
+    from playslot_rl.config.experiment import ExperimentConfig
 
 GROUP: Final = "playslot_rl.methods"
 """Entry points by which a package brings a method: its name, and a `Method`."""
@@ -48,6 +50,7 @@ class Method:
         stages: that are trained one after the other; the last one's checkpoint is the method's.
         load: as what it is loaded.
         told: whether its policy can be told which of several tasks an episode is of.
+        goals: whether it can be shown a goal image in place of that (`model.policy.goal`).
     """
 
     name: str
@@ -57,6 +60,7 @@ class Method:
     stages: tuple[StageSpec, ...]
     load: Load
     told: bool = False
+    goals: bool = False
 
     @property
     def title(self) -> str:
@@ -170,12 +174,20 @@ def require_method(key: str, name: str) -> None:
         raise ValueError(f"{key}: got {name!r}, expected one of {', '.join(METHODS)}")
 
 
-def require_told(env: EnvConfig, name: str) -> None:
-    """Refuse a method that acts and cannot be told the task, where there are several, by a ConfigError."""
-    if env.tasks and METHODS[name].acts and not METHODS[name].told:
+def require_told(config: ExperimentConfig, name: str) -> None:
+    """Refuse a method that acts and cannot be told what to do, where there are several tasks, or by goal images, where
+    these are asked for, by a ConfigError.
+    """
+    kind = METHODS[name]
+    if kind.acts and config.model.policy.goal and not kind.goals:
+        able = ", ".join(method.name for method in METHODS.values() if method.goals)
+        raise ConfigError(
+            f"model.policy.goal: got true with method={name}, expected one that can be shown goal images: {able}"
+        )
+    if config.env.tasks and kind.acts and not kind.told:
         able = ", ".join(method.name for method in METHODS.values() if method.told)
         raise ConfigError(
-            f"env.task={env.task}: got method={name}, expected one that is told which of its tasks to do: {able}"
+            f"env.task={config.env.task}: got method={name}, expected one that is told which of its tasks to do: {able}"
         )
 
 

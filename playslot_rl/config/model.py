@@ -185,6 +185,7 @@ class PolicyConfig(Checked):
         whiten: it gives whitened coordinates; `behaviour.whiten` sets it.
         slots: those that it sees, from 1; none: all.
         gain: `behaviour.gain` sets it.
+        goal: it is shown a goal image, in place of a task's number.
     """
 
     group = "model.policy."
@@ -196,6 +197,7 @@ class PolicyConfig(Checked):
     whiten: bool = field(default=False, metadata=was(False) | set_by("behaviour.whiten"))
     slots: tuple[int, ...] = field(default=(), metadata=CHOSEN)
     gain: float = field(default=1.0, metadata=UNSAID | between(0, 1, "0 to 1") | set_by("behaviour.gain"))
+    goal: bool = field(default=False, metadata=UNSAID)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -24,7 +24,7 @@ from torch import Tensor
 from playslot_rl.config import DataConfig
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import note_read
-from playslot_rl.data.neighbours import in_batches
+from playslot_rl.data.neighbours import Ends, in_batches
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.tasks import told_tasks
 from playslot_rl.data.views import acting_first, drawn_demonstrations, episode_range, first_demonstrations
@@ -35,7 +35,7 @@ from playslot_rl.world_model import WorldModel
 
 FRAMES_AT_ONCE = 1024
 EPISODES_AT_ONCE = 64  # that are labelled
-BY_ROW: Final = ("slots", "imagined", "latents", "actions", "episode", "step", "task")
+BY_ROW: Final = ("slots", "imagined", "latents", "actions", "episode", "step", "task", "goal")
 """Parts of `Demonstrations` that have a row a transition."""
 MotionOf = Callable[[npt.NDArray[np.int64]], Tensor]  # the motion (M,) of the transitions from some rows (M,)
 
@@ -54,6 +54,7 @@ class Demonstrations:
         step: number of the transition in its demonstration, int64 (M,).
         lengths: transitions of each demonstration as it was recorded, int64 (R,).
         task: which of several tasks it is of, int64 (M, 1); None where there is one.
+        goal: slots of the frame in which it ends (M, N, D); None where no policy is shown goals.
     """
 
     slots: Tensor
@@ -64,6 +65,12 @@ class Demonstrations:
     step: Tensor
     lengths: Tensor
     task: Tensor | None = None
+    goal: Tensor | None = None
+
+    @property
+    def told(self) -> Tensor | None:
+        """What a policy is told of what to do."""
+        return self.task if self.goal is None else self.goal
 
     def take(self, rows: Tensor) -> Demonstrations:
         """Some transitions, by an index int64 (M',) or a mask bool (M,); `lengths` stays."""
@@ -222,6 +229,11 @@ def moving_frames(source: EpisodeFrames, threshold: float, margin: int) -> Trans
     return transitions(source).trimmed(motion, threshold, margin, "behaviour.trim_pixels")
 
 
+def ends_in(source: EpisodeFrames, slots: npt.NDArray[np.float32], moves: Transitions) -> Tensor:
+    """Slots (M, N, D) of the frame in which the episode of each transition ends: a goal that was reached."""
+    return torch.from_numpy(slots[Ends.of(source).last[moves.rows]])
+
+
 def moving_slots(moves: Transitions, slots: npt.NDArray[np.float32], threshold: float, margin: int) -> Transitions:
     """Those transitions in which the slots (F, N, D) move: `slot_motion` above `threshold`. A DataError where nothing
     is left."""
@@ -333,6 +345,7 @@ def label_demonstrations(
     of_kept[moving.rows] = np.arange(len(moving.rows))
     actions = None if source.actions is None else real_actions(source, moving.rows, model.env.action_dim).to(device)
     task, labels = told_tasks(source, moving, model.env), tuple[Tensor, ...]()
+    goal = ends_in(source, slots, moving).to(device) if model.config.policy.goal else None
     for length in np.unique(source.lengths[source.lengths >= 2]):
         for chosen in in_batches(np.nonzero(source.lengths == length)[0], EPISODES_AT_ONCE):
             frames = source.starts[chosen][:, None] + np.arange(length)
@@ -352,6 +365,7 @@ def label_demonstrations(
         step=torch.from_numpy(moving.step).to(device),
         lengths=torch.from_numpy(moving.lengths),
         task=None if task is None else task.to(device),
+        goal=goal,
     )
 
 

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, RandomActor
+from playslot_rl.acting.actor import Actor, RandomActor, goal_slots
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.episodes import Moment, Outcome, run_episodes
 from playslot_rl.acting.planners import build_planner, search_size
-from playslot_rl.acting.planners.costs import GoalCost, goal_distance, parse_goal
+from playslot_rl.acting.planners.costs import GoalCost, goal_distance
 from playslot_rl.acting.planning import PlanningActor
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.planning import CostName, GoalName
@@ -76,6 +76,7 @@ def ways_of_acting(
     if config.evaluation.references:
         actors["random"] = RandomActor(steps_to_act(config, protocol), config.acting.action_dim)
         actors["policy"] = playslot_actor(agent)
+        actors["policy"].goals = image_of
     for name in plan.planner:
         planner = build_planner(name, plan, size, agent.world_model)
         for proposal in plan.proposal:
@@ -193,7 +194,7 @@ def cost_along_solution(
         frames = normalise(torch.from_numpy(goal.frames).movedim(-1, -3).to(device))
         slots = model.savi.parse(frames[None], goal.seed)[0]
         state = model.savi(frames[None, :1], generator=torch.Generator(device).manual_seed(goal.seed))[1]
-        there = parse_goal(model.savi, state, goal.image[None].to(device), looks)[0]
+        there = goal_slots(model.savi, state, goal.image[None].to(device), looks)[0]
         distances = {kind: goal_distance(agent, kind, there, goal.image.to(device), match) for kind in curves}
         for name, to_goal in distances.items():
             curves[name].append([round(value, 6) for value in to_goal(slots).tolist()])

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from playslot_rl.acting.actor import Actor, ExpertActor, RandomActor
-from playslot_rl.acting.agent import ImaginationActor, ReplayActor, oracle_actor, perform, playslot_actor
+from playslot_rl.acting.agent import ImaginationActor, ReplayActor, oracle_actor, perform, playslot_actor, show_goals
 from playslot_rl.acting.episodes import Outcome, TaskPool, run_episodes
 from playslot_rl.config import EnvConfig, ExperimentConfig, to_dict
 from playslot_rl.config.methods import METHODS, method_stage
@@ -125,7 +125,6 @@ def evaluate(
         raise ConfigError(f"protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
     agent.eval()
     oracle = None if agent.oracle is None else oracle_actor(agent)
-    # The expert plays an episode while the pool's own environments wait at its first frame.
     with TaskPool(config.acting, config.render) as stage:
         actor: Actor
         if protocol == "simulation":
@@ -154,7 +153,10 @@ def measure(
     """Measure any actor in evaluation mode, as `evaluate` does; null values of the slot oracle without an `oracle`."""
     seeds = held_out_seeds(config, seed, episodes, run)
     begin = time.perf_counter()
-    with TaskPool(config.acting, config.render) if pool is None else contextlib.nullcontext(pool) as used:
+    own = TaskPool(config.acting, config.render) if pool is None else contextlib.nullcontext(pool)
+    with own as used, TaskPool(config.acting, config.render) as stage:
+        for one in (actor, oracle):
+            show_goals(one, stage)
         outcome = run_episodes(used, actor, seeds)
         wall = time.perf_counter() - begin
         references: dict[str, dict[str, Any]] = {n: {"success_rate": None, "ci95": None} for n in REFERENCES}

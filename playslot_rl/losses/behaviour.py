@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from playslot_rl import keys
+from playslot_rl.modules.policy import told_keys
 from playslot_rl.runtime.shares import averaged
 
 
@@ -32,8 +33,8 @@ class _CloningLoss(LossModule):
     @dataclass
     class _AcceptedKeys:
         """Keys that `set_keys` can rename: what the network reads, the target, what a decoder with `reads_slots` reads
-        beside it, the task that a policy is told, and an optional mask, bool (...), that leaves targets out where it is
-        False.
+        beside it, the task or the goal's slots that a policy is told, and an optional mask, bool (...), that leaves
+        targets out where it is False.
         """
 
         observation: NestedKey = keys.SLOTS
@@ -41,6 +42,7 @@ class _CloningLoss(LossModule):
         mask: NestedKey = "mask"
         state: NestedKey = keys.SLOTS
         task: NestedKey = keys.TASK
+        goal: NestedKey = keys.GOAL_SLOTS
 
     tensor_keys: _AcceptedKeys
     default_keys: ClassVar[type[Any]] = _AcceptedKeys
@@ -55,9 +57,9 @@ class _CloningLoss(LossModule):
 
     @property
     def observed(self) -> list[NestedKey]:
-        """What the network reads, in its order: a policy of several tasks is told which."""
-        told = getattr(self.network, "tasks", 0)
-        return [self.tensor_keys.observation, *([self.tensor_keys.task] if told else [])]
+        """What the network reads, in its order: a policy may be told a task or a goal."""
+        named = {keys.TASK: self.tensor_keys.task, keys.GOAL_SLOTS: self.tensor_keys.goal}
+        return [self.tensor_keys.observation, *(named[key] for key in told_keys(self.network))]
 
     @property
     def in_keys(self) -> list[NestedKey]:

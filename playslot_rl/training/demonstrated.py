@@ -16,6 +16,7 @@ from playslot_rl.data.cache import Cache
 from playslot_rl.data.demonstrations import (
     DemonstrationSplit,
     Transitions,
+    ends_in,
     moving_slots,
     real_actions,
     transitions,
@@ -56,13 +57,14 @@ def demonstration_views(
 
 
 class Moves(NamedTuple):
-    """Transitions of demonstrations in which slots move: their slots (M, N, D), real actions (M, A), and task int64
-    (M, 1) where there are several; and where they are among the frames of each view.
+    """Transitions of demonstrations in which slots move: their slots (M, N, D), real actions (M, A), and what a policy
+    is told of what to do: which of several tasks, int64 (M, 1), or the slots in which each ends (M, N, D); and where
+    they are among the frames of each view.
     """
 
     slots: Tensor
     actions: Tensor
-    task: Tensor | None
+    told: Tensor | None
     found: list[Transitions]
 
 
@@ -71,12 +73,13 @@ def moves(views: list[ParsedVideos], config: ExperimentConfig, device: torch.dev
     own, env = config.behaviour, config.env
     found = [moving_slots(transitions(frames), slots, own.trim, own.trim_margin) for frames, slots in views]
     pairs = list(zip(views, found, strict=True))
-    told = [told_tasks(frames, moving, env) for (frames, _), moving in pairs]
-    task = [each for each in told if each is not None]
+    told = [each for (frames, _), moving in pairs if (each := told_tasks(frames, moving, env)) is not None]
+    if config.model.policy.goal:
+        told = [ends_in(frames, slots, moving) for (frames, slots), moving in pairs]
     return Moves(
         torch.cat([torch.from_numpy(slots[moving.rows]) for (_, slots), moving in pairs]).to(device),
         torch.cat([real_actions(frames, moving.rows, env.action_dim) for (frames, _), moving in pairs]).to(device),
-        torch.cat(task).to(device) if task else None,
+        torch.cat(told).to(device) if told else None,
         found,
     )
 

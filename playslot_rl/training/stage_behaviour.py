@@ -62,13 +62,13 @@ def cloning_settings(config: BehaviourStageConfig) -> BehaviourStageConfig:
 class SeenSlots:
     """What policy and decoder see of demonstrations: parsed slots (`config.parsed`), imagined ones (`config.imagined`).
 
-    They are (I, N, D) in parts, the parsed ones first; `rows` is the transition of each, int64 (I,), `task`
-    its task (I, 1) where there are several.
+    They are (I, N, D) in parts, the parsed ones first; `rows` is the transition of each, int64 (I,), `told` what a
+    policy is told there (I, ...).
     """
 
     slots: tuple[Tensor, ...]
     rows: Tensor
-    task: Tensor | None = None
+    told: Tensor | None = None
 
     @classmethod
     def of(cls, demos: Demonstrations, config: BehaviourStageConfig, horizon: int | None) -> SeenSlots:
@@ -77,14 +77,14 @@ class SeenSlots:
         """
         rows = torch.arange(len(demos.slots), device=demos.slots.device)
         if not config.imagined:
-            return cls((demos.slots,), rows, demos.task)
+            return cls((demos.slots,), rows, demos.told)
         far = rows if horizon is None else rows[demos.step <= horizon]
         imagined = demos.imagined if len(far) == len(rows) else demos.imagined[far]
         slots, rows = ((imagined,), far) if not config.parsed else ((demos.slots, imagined), torch.cat((rows, far)))
-        return cls(slots, rows, None if demos.task is None else demos.task[rows])
+        return cls(slots, rows, None if demos.told is None else demos.told[rows])
 
     def inputs(self, noise: float = 0.0, stream: str = "noise") -> Inputs:
-        return PairedInputs.told(TensorInputs(self.slots, noise, stream), self.task)
+        return PairedInputs.told(TensorInputs(self.slots, noise, stream), self.told, noise)
 
 
 class CloneStage:
@@ -134,9 +134,9 @@ class CloneStage:
         }
         if oracle is not None:
             acted = _acted(held_out)
-            measured = None if acted is None else (acted.slots, acted.require_actions(), acted.task)
+            measured = None if acted is None else (acted.slots, acted.require_actions(), acted.told)
             actions = demos.require_actions()
-            self.stages["oracle"] = oracle_stage(oracle, demos.slots, actions, config, measured, demos.task)
+            self.stages["oracle"] = oracle_stage(oracle, demos.slots, actions, config, measured, demos.told)
 
     @property
     def modules(self) -> Mapping[str, nn.Module]:
@@ -162,7 +162,7 @@ class CloneStage:
 
 def _checks(demos: Demonstrations, ending: str = "") -> dict[str, Examples]:
     return {
-        f"unexplained_{name}{ending}": (PairedInputs.told(TensorInputs(slots), demos.task), demos.latents)
+        f"unexplained_{name}{ending}": (PairedInputs.told(TensorInputs(slots), demos.told), demos.latents)
         for name, slots in (("parsed", demos.slots), ("imagined", demos.imagined))
     }
 
@@ -339,11 +339,11 @@ class _Both(nn.Module):
     def __init__(self, policy: Any, decoder: ActionDecoder, blind: bool = False) -> None:
         super().__init__()
         self.policy, self.decoder, self.blind = policy, decoder, blind
-        self.tasks = getattr(policy, "tasks", 0)
+        self.tasks, self.goal = getattr(policy, "tasks", 0), getattr(policy, "goal", False)
 
-    def forward(self, observed: Tensor, *task: Tensor) -> Tensor:
-        features = self.policy.features(observed, *task)
-        out: Tensor = self.decoder(self.policy.decide(features, *task), None if self.blind else features)
+    def forward(self, observed: Tensor, *told: Tensor) -> Tensor:
+        features = self.policy.features(observed, *told)
+        out: Tensor = self.decoder(self.policy.decide(features, *told), None if self.blind else features)
         return out
 
 
@@ -380,18 +380,18 @@ def oracle_stage(
     actions: Tensor,
     config: BehaviourStageConfig,
     held_out: tuple[Tensor, Tensor, Tensor | None] | None = None,
-    task: Tensor | None = None,
+    told: Tensor | None = None,
     name: str = "oracle",
 ) -> RegressionStage:
-    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations, and which task
-    (M, 1) they are of where there are several; the held-out ones only measure. `name` is of its losses and its noise.
+    """The slot oracle's training: real actions (M, A) from parsed slots (M, N, D) of all demonstrations, and what it is
+    told (M, ...) of what to do; the held-out ones only measure. `name` is of its losses and its noise.
     """
     criterion = BehaviourLoss(oracle, config.loss)
     criterion.set_keys(action=keys.ACTION)
     return RegressionStage(
         name,
         criterion,
-        PairedInputs.told(TensorInputs(slots, config.slot_noise, f"{name}_noise"), task),
+        PairedInputs.told(TensorInputs(slots, config.slot_noise, f"{name}_noise"), told, config.slot_noise),
         actions,
         config.batch_size,
         held_out=held_out and (PairedInputs.told(TensorInputs(held_out[0]), held_out[2]), held_out[1]),

@@ -86,9 +86,13 @@ class PairedInputs:
         self.parts = parts
 
     @classmethod
-    def told(cls, observed: Inputs, task: Tensor | None) -> Inputs:
-        """What a policy reads: an observation, and the task (M, 1) where it is told."""
-        return observed if task is None else cls(observed, TensorInputs(task))
+    def told(cls, observed: Inputs, told: Tensor | None, noise: float = 0.0) -> Inputs:
+        """What a policy reads: an observation, and the task (M, 1) or the goal's slots (M, N, D), these with noise in
+        training, where it is told.
+        """
+        if told is None:
+            return observed
+        return cls(observed, TensorInputs(told, noise if told.is_floating_point() else 0.0, "goal_noise"))
 
     def __len__(self) -> int:
         return len(self.parts[0])

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.agent import ImaginationActor, playslot_actor
+from playslot_rl.acting.agent import ImaginationActor, playslot_actor, show_goals
 from playslot_rl.acting.episodes import Moment, Outcome, TaskPool, record
 from playslot_rl.colours import segmentation
 from playslot_rl.frames import to_float, to_uint8
@@ -97,7 +97,11 @@ def run_rollouts(agent: Agent, pool: TaskPool, seeds: Sequence[int]) -> tuple[Fr
         if moment.step == 0 and moment.seen is not None:
             unfolded.append(moment.seen.get(keys.PREDICTED_SLOTS))
 
-    executed, executed_outcome = record(pool, ImaginationActor(agent, pool.env.max_steps), seeds, keep_imagined)
+    imagining, observing = ImaginationActor(agent, pool.env.max_steps), playslot_actor(agent)
+    with TaskPool(pool.env, pool.render) as stage:
+        for actor in (imagining, observing):
+            show_goals(actor, stage)
+        executed, executed_outcome = record(pool, imagining, seeds, keep_imagined)
+        closed, closed_outcome = record(pool, observing, seeds)
     imagined = np.stack([to_uint8(agent.world_model.savi.decode(s).frames) for s in torch.cat(unfolded)])
-    closed, closed_outcome = record(pool, playslot_actor(agent), seeds)
     return np.stack([imagined, executed, closed], 1), executed_outcome, closed_outcome

@@ -167,14 +167,3 @@ class NearProposal:
         """Latent actions (M, H, [N,] Z) to costs (M,)."""
         strayed = self.whitening.turn(latents - self.proposal).square()
         return self.cost(latents) + self.weight * strayed.flatten(1).mean(1)
-
-
-@torch.no_grad()
-def parse_goal(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tensor:
-    """Slots (n, N, D) of goal images (n, 3, H, W) as SAVi would track them: parsed as the frame after the first one,
-    with the state (n, N, D) that it left. Parsed as a first frame they lie five times as far from the tracked ones. The
-    image is shown `looks` times; a far goal may take the slots more than one correction to reach.
-    """
-    clip = normalise(goal)[:, None].expand(-1, looks, -1, -1, -1)
-    slots: Tensor = savi(clip, state)[0]
-    return slots[:, -1]

@@ -90,4 +90,4 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     build = partial(LatentPolicy, model.policy, width, own.latent_dim, tasks=len(env.tasks))
     parts = DecodedPolicy.load(done, build, own.latent_dim, width, device)
     heads = latent_policy_module(parts.policy), action_decoder_module(parts.action_decoder)
-    return SlotActor(savi, *heads, tasks=len(env.tasks))
+    return SlotActor(savi, *heads, policy=parts.policy)

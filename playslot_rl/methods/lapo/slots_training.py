@@ -86,8 +86,8 @@ class LAPOSlotsBehaviour(LatentCloning):
         parts = ([getattr(moving, name) for moving in found.found] for name in ("rows", "episode", "step"))
         rows, episode, step = map(np.concatenate, parts)
         joined = Transitions(rows, episode, step, found.found[0].lengths)
-        inputs = PairedInputs.told(TensorInputs(found.slots, self.noise, "policy_noise"), found.task)
-        return Seen(inputs, torch.cat(latents), found.actions, joined, found.task)
+        inputs = PairedInputs.told(TensorInputs(found.slots, self.noise, "policy_noise"), found.told)
+        return Seen(inputs, torch.cat(latents), found.actions, joined, found.told)
 
 
 def policy(record: StageRecord) -> Training:

@@ -40,4 +40,5 @@ PLAYSLOT: Final = Method(
     (SLOTS, DYNAMICS, POLICY),
     Load(actor="playslot_rl.methods.playslot.load:load_actor", video="playslot_rl.methods.playslot.load:load_video"),
     told=True,
+    goals=True,
 )

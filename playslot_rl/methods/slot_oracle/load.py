@@ -21,4 +21,4 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     done, savi = run.stage(NAME, "slots"), run.load_savi(device)
     model, env = done.sizes
     oracle = done.restore(lambda: untrained_oracle(model.policy, savi.config.slot_dim, env), "oracle", device)
-    return SlotActor(savi, oracle_module(oracle), tasks=oracle.tasks)
+    return SlotActor(savi, oracle_module(oracle), policy=oracle)

@@ -22,7 +22,7 @@ def training(record: StageRecord) -> Training:
         oracle = untrained_oracle(config.model.policy, savi.config.slot_dim, config.env).to(device)
     views, others = demonstration_views(config, split, savi, record.prints["slots"])
     seen, other = moves(views, config, device), moves(others, config, device) if others else None
-    measured = other and (other.slots, other.actions, other.task)
-    stage = oracle_stage(oracle, seen.slots, seen.actions, config.behaviour, measured, seen.task)
+    measured = other and (other.slots, other.actions, other.told)
+    stage = oracle_stage(oracle, seen.slots, seen.actions, config.behaviour, measured, seen.told)
     part = Part(record.name, stage, config.behaviour, group="behaviour")
     return cloning_alone(record, part, len(seen.slots), views=len(views))

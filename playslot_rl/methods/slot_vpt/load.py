@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import torch
@@ -20,7 +21,7 @@ TWO: Final = ("labeller", "oracle")
 def networks(sizes: PolicyConfig, slot_dim: int, env: EnvConfig) -> tuple[LatentPolicy, LatentPolicy]:
     """Labeller, of slots and their change beside each other, and policy, untrained."""
     policy = untrained_oracle(sizes, slot_dim, env)
-    return LatentPolicy(sizes, 2 * slot_dim, env.action_dim), policy
+    return LatentPolicy(replace(sizes, goal=False), 2 * slot_dim, env.action_dim), policy
 
 
 def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
@@ -28,4 +29,4 @@ def load_actor(run: Run, device: torch.device | str = "cpu") -> Actor:
     done, savi = run.stage(NAME, "slots"), run.load_savi(device)
     model, env = done.sizes
     _, policy = done.restore_several(TWO, lambda: networks(model.policy, savi.config.slot_dim, env), device)
-    return SlotActor(savi, oracle_module(policy), tasks=policy.tasks)
+    return SlotActor(savi, oracle_module(policy), policy=policy)

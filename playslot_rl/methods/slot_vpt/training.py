@@ -42,14 +42,14 @@ from playslot_rl.training.stage_regression import RegressionStage
 
 class Changes(NamedTuple):
     """Transitions: slots before (M, N, D) and their change to those after, real actions (M, A), the demonstration of
-    each int64 (M,), and its task (M, 1) where there are several.
+    each int64 (M,), and what a policy is told (M, ...).
     """
 
     slots: Tensor
     change: Tensor
     actions: Tensor
     episode: Tensor
-    task: Tensor | None
+    told: Tensor | None
 
     @classmethod
     def of(cls, views: list[ParsedVideos], config: ExperimentConfig, device: torch.device) -> Changes:
@@ -57,7 +57,7 @@ class Changes(NamedTuple):
         seen = moves(views, config, device)
         after = [torch.from_numpy(slots[at.rows + 1]) for (_, slots), at in zip(views, seen.found, strict=True)]
         episode = torch.cat([torch.from_numpy(at.episode) for at in seen.found]).to(device)
-        return cls(seen.slots, torch.cat(after).to(device) - seen.slots, seen.actions, episode, seen.task)
+        return cls(seen.slots, torch.cat(after).to(device) - seen.slots, seen.actions, episode, seen.told)
 
     def scale(self) -> Tensor:
         """k, which is finite where nothing moves, too."""
@@ -107,8 +107,8 @@ def training(record: StageRecord) -> Training:
         stage, labelled = labeller_stage(labeller, seen, scale, own, other), {"labelled_demos": own.labelled_demos}
         yield Part(f"{NAME}.labeller", stage, schedule, group="behaviour", renamed=renamed, identity=labelled)
         actions = pseudo_labels(labeller, seen, scale, own.labelled_demos)
-        measured = other and (other.slots, other.actions, other.task)
-        cloning = oracle_stage(policy, seen.slots, actions, own, measured, seen.task)
+        measured = other and (other.slots, other.actions, other.told)
+        cloning = oracle_stage(policy, seen.slots, actions, own, measured, seen.told)
         yield Part(f"{NAME}.policy", cloning, own, "policy", "behaviour", identity=labelled)
 
     said, extra = cloned(NAME, split, len(seen.actions), own.labelled_demos, len(views))

@@ -231,7 +231,7 @@ def check_success(config: ExperimentConfig) -> None:
     else:
         check_task(env, expert=not config.data.demos and uses_demos(config))
     for method in config.compare.methods:
-        require_told(env, method)
+        require_told(config, method)
         check_method(config, method)
     task_results(config, [env.full_name])
     for run in world_runs(config) if uses_slots(config) else ():

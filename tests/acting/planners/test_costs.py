@@ -10,6 +10,7 @@ from tiny_savi import tiny_savi
 from torch import Tensor
 
 from playslot_rl import keys
+from playslot_rl.acting.actor import goal_slots
 from playslot_rl.acting.planners import CEMPlanner, GradientPlanner, Search, latent_statistics
 from playslot_rl.acting.planners.costs import (
     DynamicsDistance,
@@ -18,7 +19,6 @@ from playslot_rl.acting.planners.costs import (
     NearProposal,
     SlotDistance,
     assignment,
-    parse_goal,
 )
 from playslot_rl.acting.planners.torchrl_planning import ReturnAdvantage, latent_of, planning_env, planning_start
 from playslot_rl.api import PlaySlot
@@ -122,8 +122,8 @@ def test_a_goal_is_parsed_as_the_next_frame() -> None:
     start, goal = torch.rand(2, 2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     state = savi(start[:, None])[1]
     tracked = savi(torch.stack([start, goal, goal], 1))[0]
-    torch.testing.assert_close(parse_goal(savi, state, goal), tracked[:, 1])
-    torch.testing.assert_close(parse_goal(savi, state, goal, looks=2), tracked[:, 2])
+    torch.testing.assert_close(goal_slots(savi, state, goal), tracked[:, 1])
+    torch.testing.assert_close(goal_slots(savi, state, goal, looks=2), tracked[:, 2])
 
 
 def torchrl_parts(model: WorldModel, horizon: int, along: float) -> tuple[SlotDistance, Whitening, Tensor]:

@@ -1,0 +1,226 @@
+"""A policy that is shown a goal image: it acts by it, in the simulator and in imagination, and learns by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from playslot_rl import keys
+from playslot_rl.acting.actor import LOOKS, Actor, SlotActor, goal_slots
+from playslot_rl.acting.agent import ImaginationActor, imagine, oracle_actor, playslot_actor
+from playslot_rl.acting.closed_loop import ClosedLoop
+from playslot_rl.acting.episodes import TaskPool, run_episodes
+from playslot_rl.config import BehaviourStageConfig, OptimConfig, PolicyConfig
+from playslot_rl.config.compose import compose
+from playslot_rl.config.methods import METHODS, require_told
+from playslot_rl.config.plain import to_dict
+from playslot_rl.data.demonstrations import Demonstrations, label_demonstrations, transitions
+from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.success import evaluate
+from playslot_rl.modules.action_decoder import ActionDecoder
+from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.runs import Run
+from playslot_rl.testing import tiny_agent, tiny_config
+from playslot_rl.training.demonstrated import moves
+from playslot_rl.training.fit import Part, fit
+from playslot_rl.training.stage_behaviour import CloneStage, DecoderStage, FinetuneStage
+from playslot_rl.world_model import Agent
+from tests.recipes.commands import refused, smoke
+from tests.training.tiny_stages import videos
+
+SIZES = PolicyConfig(dim=16, layers=1, heads=2, head_dim=8, mlp_dim=16, goal=True)
+SHOWN = ("playslot", "slot_oracle", "slot_bc", "slot_vpt")
+
+
+def of_goals(gain: float = 1.0) -> Agent:
+    config = tiny_config(max_steps=3)
+    policy = replace(config.model.policy, goal=True, gain=gain)
+    return tiny_agent(replace(config, model=replace(config.model, policy=policy))).requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def agent() -> Agent:
+    return of_goals()
+
+
+def pictures(count: int, seed: int = 0) -> torch.Tensor:
+    draw = torch.Generator().manual_seed(seed)
+    return torch.randint(256, (count, 3, 64, 64), dtype=torch.uint8, generator=draw)
+
+
+@pytest.mark.parametrize("name", ["playslot", "oracle", "belief", "imagination"])
+def test_it_acts_by_the_goal_that_its_first_frame_finds(agent: Agent, name: str) -> None:
+    goals, frames = pictures(2), pictures(1, seed=1).expand(3, -1, -1, -1)
+    make = {
+        "playslot": lambda: playslot_actor(agent),
+        "oracle": lambda: oracle_actor(agent),
+        "belief": lambda: playslot_actor(of_goals(gain=0.5)),
+        "imagination": lambda: ImaginationActor(agent, 3),
+    }
+    actor: Actor = make[name]().eval()
+    actor.goals = lambda seeds: goals[[seed % 2 for seed in seeds]]
+    loop = ClosedLoop(actor)
+    loop.reset([0, 1, 2])
+    seen = loop.step(TensorDict({keys.PIXELS: frames}, [3]))
+    actions = seen[keys.ACTION]
+    torch.testing.assert_close(actions[0], actions[2])
+    assert (actions[0] - actions[1]).abs().max() > 1e-4
+    if isinstance(actor, SlotActor):
+        savi = agent.world_model.savi
+        _, state = savi(frames[:1, None] / 255)
+        found = seen[keys.GOAL_SLOTS].clone()
+        torch.testing.assert_close(found[:1], goal_slots(savi, state, goals[:1], LOOKS))
+        later = loop.step(TensorDict({keys.PIXELS: pictures(2, seed=2)}, [2]), rows=[1, 2])  # one has ended
+        assert torch.equal(later[keys.GOAL_SLOTS], found[1:])
+
+
+def test_imagination_is_towards_the_goal(agent: Agent) -> None:
+    draw = torch.Generator().manual_seed(0)
+    slots, goal = torch.randn(1, 4, 32, generator=draw).expand(2, -1, -1), torch.randn(2, 4, 32, generator=draw)
+    both = imagine(agent, TensorDict({keys.SLOTS: slots, keys.GOAL_SLOTS: goal}, [2]), 3).latents
+    torch.testing.assert_close(both[:, 0], agent.policy(slots, goal))
+    assert (both[0] - both[1]).abs().max() > 1e-4
+
+
+def test_who_shows_no_goal_is_told_so(agent: Agent) -> None:
+    with pytest.raises(ConfigError, match=r"model\.policy\.goal: got no goal images, expected some"):
+        ClosedLoop(playslot_actor(agent)).act(torch.rand(1, 3, 64, 64))
+
+
+def test_an_evaluation_shows_where_the_expert_ends(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The expert's last frame of the same episode, of whatever actor and protocol."""
+    config = tiny_config(max_steps=3)
+    shown: dict[int, torch.Tensor] = {}
+    reset = Actor.reset
+
+    def noted(self: Actor, seeds: list[int]) -> TensorDict:
+        memory = reset(self, seeds)
+        if self.shown_goals:
+            shown.update(zip(seeds, memory[keys.GOAL_PIXELS], strict=True))
+        return memory
+
+    monkeypatch.setattr(Actor, "reset", noted)
+    for protocol in ("simulation", "imagination"):
+        shown.clear()
+        found = evaluate(agent, config, protocol, 2, 0)
+        assert sorted(shown) == sorted(found["seeds"])
+    from playslot_rl.acting.actor import ExpertActor
+
+    last = {}
+    with TaskPool(config.env, config.render) as pool:
+        run_episodes(
+            pool, ExpertActor(), found["seeds"], lambda moment: last.update(zip(moment.episodes, moment.frames, strict=True)),
+            stop=False,
+        )  # fmt: skip
+    for i, seed in enumerate(found["seeds"]):
+        assert torch.equal(shown[seed], torch.from_numpy(last[i]).movedim(-1, 0))
+
+
+def test_policy_decoder_and_oracle_learn_what_the_slots_do_not_say(tmp_path: Path) -> None:
+    """The same slots with two goals, the opposite to do for each: untold, half of it stays unexplained at best."""
+    draw = torch.Generator().manual_seed(0)
+    slots, ends = torch.randn(20, 3, 16, generator=draw).repeat(2, 1, 1), torch.randn(2, 3, 16, generator=draw)
+    which = torch.arange(2).repeat_interleave(20)
+    actions, goal = (1.0 - 2.0 * which[:, None]) * torch.tensor([[0.5, -0.3]]), ends[which]
+    demos = Demonstrations(
+        slots, slots + 0.01, torch.cat((actions, actions), 1), actions, torch.arange(40) // 10, torch.arange(40) % 10,
+        torch.full((4,), 10),
+    )  # fmt: skip
+    own = BehaviourStageConfig(
+        steps=150, batch_size=20, labelled_demos=4, decoder_inputs="policy", validate_every=150, whiten=False,
+        optim=OptimConfig(lr=5e-3, warmup_steps=0), slot_noise=0.05,
+    )  # fmt: skip
+    left = {}
+    for shown in (replace(demos, goal=goal), demos):
+        torch.manual_seed(0)
+        told = [] if shown.goal is None else [shown.goal]
+        sizes = replace(SIZES, goal=bool(told))
+        policy, oracle = LatentPolicy(sizes, 16, 4, tasks=2 if told else 0), LatentPolicy(sizes, 16, 2, acts=True)
+        assert policy.tasks == 0
+        clone = CloneStage(policy, oracle, shown, own, shown)
+        fit(Part("policy", clone, own), tmp_path / str(len(told)), seed=0, device=torch.device("cpu"))
+        measured = clone.validate(0)
+        left[len(told)] = [
+            measured[name] for name in ("unexplained_parsed", "unexplained_imagined", "oracle_unexplained")
+        ]
+        decoder = ActionDecoder(tiny_config().model.action_decoder, 4, 2, 16)
+        heard = DecoderStage(decoder, policy, shown, own).inputs.plain(torch.arange(40))[0]
+        torch.testing.assert_close(heard[:40], policy(slots, *told))
+        both = FinetuneStage(clone.stages["policy"], decoder, shown, own)
+        acted = decoder(policy(slots, *told)).detach()
+        expected = (acted - shown.actions).square().sum() / (shown.actions - shown.actions.mean(0)).square().sum()
+        assert both.validate(0)["unexplained"] == pytest.approx(float(expected), rel=1e-3)
+    assert max(left[1]) < 0.1
+    assert min(left[0]) > 0.9
+
+
+def test_a_demonstration_ends_in_its_goal(agent: Agent) -> None:
+    source = videos(64)
+    model = agent.world_model
+    source = replace(source, actions=np.zeros((len(source.frames), 4), np.float32))
+    slots = torch.arange(len(source.frames), dtype=torch.float32)[:, None, None].expand(-1, *model.slot_shape).numpy()
+    ends = [start + length - 1 for start, length in zip(source.starts, source.lengths, strict=True)]
+    number = transitions(source).episode.tolist()
+    demos = label_demonstrations(model, source, slots)
+    assert demos.told is demos.goal is not None
+    assert demos.goal[:, 0, 0].tolist() == [ends[i] for i in number]
+    config = replace(tiny_config(), model=model.config)
+    config = replace(config, behaviour=replace(config.behaviour, trim=0.0))
+    seen = moves([(source, slots)] * 2, config, demos.slots.device)
+    assert seen.told is not None
+    assert seen.told[:, 0, 0].tolist() == [ends[i] for i in number] * 2
+
+
+def test_others_are_refused_and_old_sizes_are_the_same() -> None:
+    config = compose(["preset=smoke", "env=metaworld", "env.task=push", "model.policy.goal=true"])
+    for name, method in METHODS.items():
+        if name in SHOWN or not method.acts:
+            require_told(config, name)
+            continue
+        with pytest.raises(ConfigError, match=rf"got true with method={name}, expected one .* goal images: playslot"):
+            require_told(config, name)
+    assert "goal" not in to_dict(PolicyConfig())
+    assert to_dict(config.model.policy)["goal"] is True
+
+
+MADE = {
+    "one": ("env=button_press", "env.max_steps=3", "collect.expert_steps=3"),
+    "two": ("env=metaworld", "env.task=drawer-open+push", "env.max_steps=3", "collect.expert_steps=3"),
+}
+
+
+@pytest.fixture(scope="module", params=MADE)
+def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
+    """Demonstrations of a task, or of two, and a world model of them."""
+    base = tmp_path_factory.mktemp("goals")
+    run, demos = base / "run", base / "demos"
+    smoke("collect", *MADE[request.param], "policy=expert", "episodes=7", f"out={demos}")
+    smoke("train-slots", *MADE[request.param], f"data.root={demos}", "data.held_out=2", f"out={run}")
+    smoke("train-dynamics", f"run={run}")
+    return request.param, run, demos
+
+
+@pytest.mark.integration
+@pytest.mark.slow
+@pytest.mark.parametrize("method", SHOWN)
+def test_commands_from_videos_to_goals(method: str, recorded: tuple[str, Path, Path], tmp_path: Path) -> None:
+    (name, run, demos), own, out = recorded, METHODS[method], tmp_path / "run"
+    typed = ["preset=smoke", f"data.demos={demos}", "demos=4", "data.held_out=2", f"out={out}", *MADE[name]]
+    typed += [f"run={run}", *(["behaviour.labelled_demos=2"] if own.some_labelled else []), "model.policy.goal=true"]
+    smoke("train-policy" if method == "playslot" else "train-baseline", *typed, f"method={method}")
+    assert Run.open(out).own(own.last.name).sizes[0].policy.goal
+    for protocol in ("simulation", *(["imagination", "replay"] if method == "playslot" else [])):
+        smoke("evaluate", f"run={out}", "episodes=2", f"protocol={protocol}")
+    if method == "playslot":
+        assert (out / "report.md").is_file()
+    done = smoke("evaluate", f"run={out}", "protocol=actions", f"data.demos={demos}")
+    assert "R²" in done.out or "r2" in done.out.lower()
+    if name == "one" and method == "playslot":
+        refused("export", f"run={out}", f"out={tmp_path / 'new'}", message=r"model\.policy\.goal: got true")
+        smoke("plan", f"run={out}", "episodes=2", "planner=cem", "proposal=policy", "goals=ahead", "plan.ahead=5",
+              "plan.near=0")  # fmt: skip
