@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import LOOKS, Actor, SlotActor, goal_slots
+from playslot_rl.acting.actor import LOOKS, Actor, ExpertActor, SlotActor, goal_slots
 from playslot_rl.acting.agent import ImaginationActor, imagine, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
-from playslot_rl.acting.episodes import TaskPool, run_episodes
+from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
 from playslot_rl.config import BehaviourStageConfig, OptimConfig, PolicyConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, require_told
@@ -109,14 +109,13 @@ def test_an_evaluation_shows_where_the_expert_ends(agent: Agent, monkeypatch: py
         shown.clear()
         found = evaluate(agent, config, protocol, 2, 0)
         assert sorted(shown) == sorted(found["seeds"])
-    from playslot_rl.acting.actor import ExpertActor
+    last: dict[int, np.ndarray] = {}
 
-    last = {}
+    def note(moment: Moment) -> None:
+        last.update(zip(moment.episodes, moment.frames, strict=True))
+
     with TaskPool(config.env, config.render) as pool:
-        run_episodes(
-            pool, ExpertActor(), found["seeds"], lambda moment: last.update(zip(moment.episodes, moment.frames, strict=True)),
-            stop=False,
-        )  # fmt: skip
+        run_episodes(pool, ExpertActor(), found["seeds"], note, stop=False)
     for i, seed in enumerate(found["seeds"]):
         assert torch.equal(shown[seed], torch.from_numpy(last[i]).movedim(-1, 0))
 
