@@ -31,7 +31,7 @@ from playslot_rl.acting.closed_loop import ClosedLoop, resized
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, Reward, latent_actions
 from playslot_rl.config import ExperimentConfig, RenderConfig
 from playslot_rl.errors import CheckpointError, require_type
-from playslot_rl.frames import as_numbers, normalise
+from playslot_rl.frames import as_numbers, normalise, quantise
 from playslot_rl.modules.inverse_dynamics import LatentActions
 from playslot_rl.modules.savi import Decoded
 from playslot_rl.runs import Run
@@ -269,10 +269,21 @@ class PlaySlot:
         out: npt.NDArray[np.float32] = self._loop.actor.executed(chosen).numpy()
         return out
 
-    def reset(self) -> None:
-        """Forget the episode: the next frame `act` gets is a first one."""
-        if self._loop is not None:
-            self._loop.reset()
+    def reset(self, goal: Array | None = None) -> None:
+        """Forget the episode: the next frame `act` gets is a first one. `goal` is the image, (H, W, 3) or (3, H, W),
+        that a policy of `model.policy.goal=true` is to reach, until another is given; a ValueError for other shapes, or
+        for a policy that is shown none.
+        """
+        if self._loop is None:
+            return
+        if goal is not None:
+            actor, image = self._loop.actor, self._frames(goal)
+            if not actor.shown_goals or image.ndim != 3:
+                got = f"shape {tuple(image.shape)}" if actor.shown_goals else "an image for a policy that is shown none"
+                expected = "one image" if actor.shown_goals else "nothing, or one trained with model.policy.goal=true"
+                raise ValueError(f"goal: got {got}, expected {expected}")
+            actor.goals = lambda seeds: quantise(image).expand(len(seeds), -1, -1, -1)
+        self._loop.reset()
 
     def _require_agent(self, method: str) -> Agent:
         if self.agent is None:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from playslot_rl.config import plugins
 from playslot_rl.config.stage_spec import StageSpec
@@ -49,8 +49,8 @@ class Method:
         config: dataclass of its group of keys, `baselines.NAME`; None if it has none.
         stages: that are trained one after the other; the last one's checkpoint is the method's.
         load: as what it is loaded.
-        told: whether its policy can be told which of several tasks an episode is of.
-        goals: whether it can be shown a goal image in place of that (`model.policy.goal`).
+        told: what its policy can be told: which of several `task`s an episode is of; that, or a `goal` image in place
+            of it (`model.policy.goal`); or nothing.
     """
 
     name: str
@@ -59,8 +59,7 @@ class Method:
     config: type[Any] | None
     stages: tuple[StageSpec, ...]
     load: Load
-    told: bool = False
-    goals: bool = False
+    told: Literal["", "task", "goal"] = ""
 
     @property
     def title(self) -> str:
@@ -179,8 +178,8 @@ def require_told(config: ExperimentConfig, name: str) -> None:
     these are asked for, by a ConfigError.
     """
     kind = METHODS[name]
-    if kind.acts and config.model.policy.goal and not kind.goals:
-        able = ", ".join(method.name for method in METHODS.values() if method.goals)
+    if kind.acts and config.model.policy.goal and kind.told != "goal":
+        able = ", ".join(method.name for method in METHODS.values() if method.told == "goal")
         raise ConfigError(
             f"model.policy.goal: got true with method={name}, expected one that can be shown goal images: {able}"
         )

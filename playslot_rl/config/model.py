@@ -185,7 +185,7 @@ class PolicyConfig(Checked):
         whiten: it gives whitened coordinates; `behaviour.whiten` sets it.
         slots: those that it sees, from 1; none: all.
         gain: `behaviour.gain` sets it.
-        goal: it is shown a goal image, in place of a task's number.
+        goal: it is shown a goal image.
     """
 
     group = "model.policy."

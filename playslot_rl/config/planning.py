@@ -52,10 +52,10 @@ class PlanConfig(Checked):
         learning_rate: of the gradient planner.
         prior: with `proposal=policy`, what straying from the policy's plan costs, in whitened coordinates; 0: nothing.
         history: frames of the past that the predictor sees, at most its context.
-        looks: times that SAVi is shown the goal image, as the frames after the first.
+        looks: times that SAVi is shown the goal image.
         ahead: environment steps to the goal, with goals `ahead`.
         budget: environment steps to act in, with goals `ahead`.
-        near: metres within which everything has to be of where it is in the goal, for success by state.
+        near: metres within which everything has to be of its place in the goal, for success by state.
         pictures: episodes that are drawn.
     """
 

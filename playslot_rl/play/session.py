@@ -59,7 +59,9 @@ class PlaySession:
         self.planner: PlannerDriver | None = None
         if agent is not None:
             self.planner = PlannerDriver(agent)
-            self.drivers = {"policy": PolicyDriver(agent.policy), "planner": self.planner}
+            self.drivers["planner"] = self.planner
+            if not agent.policy.tasks:  # nobody says which
+                self.drivers = {"policy": PolicyDriver(agent.policy, self.planner), **self.drivers}
         self._imagination = ImaginationSession(world_model)
         self._decode = Captured(world_model.savi.decode, world_model.savi)
         self._look: tuple[int, Look] | None = None

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from playslot_rl.acting.planners import CEMPlanner, Search, latent_statistics, shifted
 from playslot_rl.acting.planners.costs import DynamicsDistance, GoalCost
@@ -26,6 +26,7 @@ from playslot_rl.acting.planning import policy_plan
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.errors import CheckpointError
 from playslot_rl.frames import to_float
+from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.seeds.draws import step_generator
 from playslot_rl.world_model import Agent, WorldModel, module_device
 
@@ -49,16 +50,19 @@ class Driver(Protocol):
 
 
 class PolicyDriver:
-    """The latent policy: slots (..., N, D) to a latent action (..., Z), in evaluation mode."""
+    """The latent policy: slots (..., N, D) to a latent action (..., Z), in evaluation mode; one that is shown goals
+    heads for the planner's.
+    """
 
     title = "latent policy"
 
-    def __init__(self, policy: nn.Module) -> None:
-        self.policy = policy
+    def __init__(self, policy: LatentPolicy, planner: PlannerDriver) -> None:
+        self.policy, self.planner = policy, planner
 
     @torch.no_grad()
     def choose(self, session: PlaySession) -> Tensor:
-        chosen: Tensor = self.policy(session.slots[None])[0]
+        told = [self.planner.marked()[None]] if self.policy.goal else []
+        chosen: Tensor = self.policy((_whole(session) if told else session.slots)[None], *told)[0]
         return chosen
 
 
@@ -118,7 +122,7 @@ class PlannerDriver:
         z_{1:H} = argmin d(S^_H, S_goal),   of which the first is taken, and the rest begins the next search
 
     The search begins with the latent policy's rollout, so that what it finds costs no more in imagination than what the
-    policy would do (`playslot_rl.acting.planners`).
+    policy would do (`playslot_rl.acting.planners`), unless that would have to be told which of several tasks to do.
     """
 
     title = "planner"
@@ -137,16 +141,23 @@ class PlannerDriver:
         """Mark the session's present moment as the goal; a ValueError where a slot was removed from it."""
         self.goal, self._last = _whole(session), None
 
+    def marked(self) -> Tensor:
+        """The goal; a ValueError where none is marked."""
+        if self.goal is None:
+            raise ValueError("goal: got none, expected a marked moment: go to one and press Goal, then go back")
+        return self.goal
+
     @torch.no_grad()
     def choose(self, session: PlaySession) -> Tensor:
         """The plan's first latent action (Z,) at the present slots; a ValueError where no goal is marked."""
-        if self.goal is None:
-            raise ValueError("planner: got no goal, expected a marked moment: go to one and press Goal, then go back")
+        goal, policy = self.marked(), self.agent.policy
         slots, model = _whole(session), self.agent.world_model
-        distance = DynamicsDistance(model.inverse_dynamics, self.agent.policy.whitening or self._whitening, self.goal)
+        distance = DynamicsDistance(model.inverse_dynamics, policy.whitening or self._whitening, goal)
         past = slots.new_empty(0, *model.latent_shape)
         cost = GoalCost(model, slots[None], past, distance, self._along)
-        starts = policy_plan(self.agent, slots, HORIZON)
+        starts = slots.new_empty(0, HORIZON, *model.latent_shape)
+        if not policy.tasks:
+            starts = policy_plan(self.agent, slots, HORIZON, goal)
         now = session.now
         if self._last is not None and self._last[0] == now.parent:
             starts = torch.cat([starts, shifted(self._last[1], 1, self._whitening.mean)[None]])

@@ -15,6 +15,8 @@ from playslot_rl.acting.actor import LOOKS, Actor, ExpertActor, SlotActor, goal_
 from playslot_rl.acting.agent import ImaginationActor, imagine, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.episodes import Moment, TaskPool, run_episodes
+from playslot_rl.acting.planning import policy_plan
+from playslot_rl.api import PlaySlot
 from playslot_rl.config import BehaviourStageConfig, OptimConfig, PolicyConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, require_told
@@ -24,6 +26,8 @@ from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.success import evaluate
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.play.session import PlaySession
+from playslot_rl.play.starts import Start
 from playslot_rl.runs import Run
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.training.demonstrated import moves
@@ -90,6 +94,36 @@ def test_imagination_is_towards_the_goal(agent: Agent) -> None:
 def test_who_shows_no_goal_is_told_so(agent: Agent) -> None:
     with pytest.raises(ConfigError, match=r"model\.policy\.goal: got no goal images, expected some"):
         ClosedLoop(playslot_actor(agent)).act(torch.rand(1, 3, 64, 64))
+
+
+def test_a_frame_is_a_goal_of_the_programming_interface(agent: Agent) -> None:
+    model, frame = PlaySlot(agent.world_model, agent), pictures(1, seed=1)[0]
+    first = []
+    for goal in pictures(2):
+        model.reset(goal)
+        first.append(model.act(frame))
+        model.reset()
+        assert np.array_equal(model.act(frame), first[-1]), "the goal stays"
+    assert np.abs(first[0] - first[1]).max() > 1e-5
+    model.reset(pictures(1)[0].movedim(0, -1).numpy())
+    assert np.array_equal(model.act(frame), first[0])
+    with pytest.raises(ValueError, match=r"goal: got shape \(2, 3, 64, 64\), expected one image"):
+        model.reset(pictures(2))
+    with pytest.raises(ValueError, match=r"goal: got an image for a policy that is shown none, expected nothing"):
+        PlaySlot.untrained().reset(frame)
+
+
+def test_who_plays_marks_the_goal(agent: Agent) -> None:
+    session = PlaySession(agent.world_model, agent)
+    policy, slots = session.drivers["policy"], torch.randn(4, 32, generator=torch.Generator().manual_seed(0))
+    session.begin(Start("", np.zeros((64, 64, 3), np.uint8), slots[None]))
+    with pytest.raises(ValueError, match="goal: got none, expected a marked moment"):
+        policy.choose(session)
+    assert session.planner is not None
+    session.planner.goal = slots.flip(0)
+    torch.testing.assert_close(policy.choose(session), agent.policy(slots, slots.flip(0)))
+    torch.testing.assert_close(policy_plan(agent, slots, 2, slots.flip(0))[0, 0], agent.policy(slots, slots.flip(0)))
+    assert session.planner.choose(session).shape == agent.world_model.latent_shape
 
 
 def test_an_evaluation_shows_where_the_expert_ends(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,6 +35,8 @@ from playslot_rl.methods.lapo.method import LAPOConfig
 from playslot_rl.methods.lapo.model import LAPOPolicy
 from playslot_rl.modules.action_decoder import ActionDecoder
 from playslot_rl.modules.policy import LatentPolicy
+from playslot_rl.play.session import PlaySession
+from playslot_rl.play.starts import Start
 from playslot_rl.runs import Run
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.training import record
@@ -84,6 +86,15 @@ def test_imagination_is_of_the_task(agent: Agent) -> None:
 def test_act_without_seeds_is_refused(agent: Agent) -> None:
     with pytest.raises(ConfigError, match=r"expected reset\(seeds\)"):
         ClosedLoop(playslot_actor(agent)).act(torch.rand(1, 3, 64, 64))
+
+
+def test_who_plays_cannot_tell_it_and_plans(agent: Agent) -> None:
+    session = PlaySession(agent.world_model, agent)
+    assert list(session.drivers) == ["planner"]
+    assert session.planner is not None
+    session.begin(Start("", np.zeros((64, 64, 3), np.uint8), torch.randn(1, 4, 32)))
+    session.planner.aim(session)
+    assert session.planner.choose(session).shape == agent.world_model.latent_shape
 
 
 def test_policy_decoder_and_oracle_learn_what_the_slots_do_not_say(tmp_path: Path) -> None:

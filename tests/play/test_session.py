@@ -203,7 +203,7 @@ def test_previews_are_what_the_presses_would_do(session: PlaySession) -> None:
 @pytest.mark.integration
 def test_the_planner_steers_to_the_moment_that_is_marked(session: PlaySession) -> None:
     assert session.planner is not None
-    with pytest.raises(ValueError, match="planner: got no goal, expected a marked moment"):
+    with pytest.raises(ValueError, match="goal: got none, expected a marked moment"):
         session.drive("planner")
     start = session.slots
     for number in (2, 2, 4):

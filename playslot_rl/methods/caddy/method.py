@@ -165,7 +165,7 @@ _LOADED: Final = "playslot_rl.methods.caddy.heads"
 CADDY: Final = Method("caddy", ("CADDY",), Style(5, "s"), CADDYConfig, (MODEL,), Load(video=f"{_LOADED}:load_video"))
 CADDY_POLICY: Final = Method(
     "caddy_policy", ("CADDY",), Style(6, "X"), CADDYPolicyConfig, (MODEL, POLICY),
-    Load(actor=f"{_LOADED}:load_policy"), told=True,
+    Load(actor=f"{_LOADED}:load_policy"), told="task",
 )  # fmt: skip
 CADDY_ORACLE: Final = Method(
     "caddy_oracle",
@@ -174,5 +174,5 @@ CADDY_ORACLE: Final = Method(
     CADDYOracleConfig,
     (MODEL, ORACLE),
     Load(actor=f"{_LOADED}:load_oracle"),
-    told=True,
+    told="task",
 )

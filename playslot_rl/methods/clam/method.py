@@ -67,5 +67,5 @@ POLICY: Final = StageSpec(
 )
 CLAM: Final = Method(
     NAME, ("CLAM",), Style(5, "*"), CLAMConfig, (MODEL, POLICY),
-    Load(actor="playslot_rl.methods.clam.model:load_actor"), told=True,
+    Load(actor="playslot_rl.methods.clam.model:load_actor"), told="task",
 )  # fmt: skip

@@ -112,7 +112,7 @@ def _method(
     )
     return Method(
         name, (title,), style, config, parts,
-        Load(actor=f"playslot_rl.methods.frozen_encoder.network:load_{stage}"), told=True,
+        Load(actor=f"playslot_rl.methods.frozen_encoder.network:load_{stage}"), told="task",
     )  # fmt: skip
 
 

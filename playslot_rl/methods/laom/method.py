@@ -86,5 +86,5 @@ POLICY: Final = StageSpec(
 )  # fmt: skip
 LAOM: Final = Method(
     NAME, ("LAOM",), Style(5, "H"), LAOMConfig, (MODEL, POLICY),
-    Load(actor="playslot_rl.methods.laom.model:load_actor"), told=True,
+    Load(actor="playslot_rl.methods.laom.model:load_actor"), told="task",
 )  # fmt: skip

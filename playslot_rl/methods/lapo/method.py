@@ -152,5 +152,5 @@ POLICY: Final = StageSpec(
 )  # fmt: skip
 LAPO: Final = Method(
     NAME, ("LAPO",), Style(5, "s"), LAPOConfig, (MODEL, POLICY),
-    Load(actor="playslot_rl.methods.lapo.model:load_actor"), told=True,
+    Load(actor="playslot_rl.methods.lapo.model:load_actor"), told="task",
 )  # fmt: skip

@@ -185,7 +185,7 @@ def _method(
     )
     return Method(
         name, titles, style, config, (stage,),
-        Load(actor=f"playslot_rl.methods.lerobot_policy.actor:load_{name}"), told=True,
+        Load(actor=f"playslot_rl.methods.lerobot_policy.actor:load_{name}"), told="task",
     )  # fmt: skip
 
 

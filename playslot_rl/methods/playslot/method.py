@@ -39,6 +39,5 @@ PLAYSLOT: Final = Method(
     None,
     (SLOTS, DYNAMICS, POLICY),
     Load(actor="playslot_rl.methods.playslot.load:load_actor", video="playslot_rl.methods.playslot.load:load_video"),
-    told=True,
-    goals=True,
+    told="goal",
 )

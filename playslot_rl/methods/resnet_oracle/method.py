@@ -73,12 +73,12 @@ _WITH_HISTORY: Final = replace(
     names={"baselines.resnet_oracle": HISTORY},
 )
 RESNET_ORACLE: Final = Method(
-    NAME, ("ResNet Oracle", "ResNet"), Style(1, "v"), ResNetOracleConfig, (STAGE,), _LOAD, told=True
+    NAME, ("ResNet Oracle", "ResNet"), Style(1, "v"), ResNetOracleConfig, (STAGE,), _LOAD, told="task"
 )
 RESNET_BC: Final = Method(
-    "resnet_bc", ("ResNet BC",), Style(1, ">"), None, (replace(STAGE, data="labelled"),), _LOAD, told=True
+    "resnet_bc", ("ResNet BC",), Style(1, ">"), None, (replace(STAGE, data="labelled"),), _LOAD, told="task"
 )
 HISTORY_BC: Final = Method(
     HISTORY, ("ResNet BC with history",), Style(1, "$H$"), None, (_WITH_HISTORY,),
-    Load(actor="playslot_rl.methods.resnet_oracle.network:load_with_history"), told=True,
+    Load(actor="playslot_rl.methods.resnet_oracle.network:load_with_history"), told="task",
 )  # fmt: skip

@@ -23,7 +23,7 @@ STAGE: Final = StageSpec(
     names={"behaviour": NAME},
 )
 _LOAD: Final = Load(actor="playslot_rl.methods.slot_oracle.load:load_actor")
-SLOT_ORACLE: Final = Method(NAME, ("Slot Oracle",), Style(2, "^"), None, (STAGE,), _LOAD, told=True, goals=True)
+SLOT_ORACLE: Final = Method(NAME, ("Slot Oracle",), Style(2, "^"), None, (STAGE,), _LOAD, told="goal")
 SLOT_BC: Final = replace(
     SLOT_ORACLE, name="slot_bc", titles=("Slot BC",), style=Style(2, "<"), stages=(replace(STAGE, data="labelled"),)
 )
