@@ -4,6 +4,7 @@ evaluation seeds, a fixed list, never one that was collected for training.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -147,9 +148,9 @@ def _policy_held_out(source: EpisodeFrames, policy: Mapping[str, Any], config: D
     held, demos = int(policy.get("held_out_demos", 0)), int(policy.get("demos", 0))
     if not held or not 0 < demos <= source.recordings - held:
         return 0
-    # Its checkpoint names the demonstrations it was trained on, which a draw may have chosen.
-    draws = {None, config.draw, int(policy.get("seed", 0))}
-    prints = {split_demonstrations(source, demos, held, held, draw).trained.fingerprint for draw in draws}
+    # Its checkpoint names the demonstrations it was trained on, which a draw may have chosen, or their actions.
+    ways = itertools.product({None, config.draw, int(policy.get("seed", 0))}, (False, True))
+    prints = {split_demonstrations(source, demos, held, held, *way).trained.fingerprint for way in ways}
     return held if policy.get("data", {}).get("demos") in prints else 0
 
 

@@ -291,6 +291,13 @@ def test_the_policys_demonstrations_are_measured_on_those_it_held_out() -> None:
     assert hold_out(source, {"policy": policy | {"demos": 7}}, DataConfig(), 100).known is False
     named = hold_out(source, {}, DataConfig(held_out=2), 100)
     assert (named.tested.tolist(), named.known) == ([10, 11], False)
+    actions = np.zeros((len(source.frames), 2), np.float32)
+    actions[source.episode_rows(0)] = np.nan  # whose others are labelled first
+    silent = replace(source, actions=actions, unlabelled="b")
+    trained = split_demonstrations(silent, 8, 3, 3, None, acted=True).trained.fingerprint
+    assert trained != split_demonstrations(silent, 8, 3, 3).trained.fingerprint
+    told = hold_out(silent, {"policy": policy | {"data": {"demos": trained}}}, DataConfig(), 100).told_by
+    assert told.startswith("the last 3 episodes, which are held out from the policy's training")
 
 
 def test_at_most_so_many_episodes_are_taken_and_short_ones_left_out() -> None:
