@@ -7,8 +7,10 @@ Shapes: E episodes, T agent steps, N slots, D slot width, Z latent-action width,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -16,7 +18,7 @@ from torch import Tensor
 from playslot_rl import keys
 from playslot_rl.acting.actor import LOOKS, Actor, ExpertActor, PlannedActor, SlotActor, goal_slots, put_rows
 from playslot_rl.acting.belief import BeliefActor
-from playslot_rl.acting.episodes import Moment, TaskPool, record
+from playslot_rl.acting.episodes import Moment, TaskPool, record, run_episodes
 from playslot_rl.acting.imagination import ImaginationEnv
 from playslot_rl.frames import normalise
 from playslot_rl.modules.policy import told_keys
@@ -128,7 +130,21 @@ def show_goals(actor: Actor | None, stage: TaskPool) -> None:
     episodes; it plays them on a stage of its own, while the actor's environments wait at their first frames.
     """
     if actor is not None and actor.shown_goals and actor.goals is None:
-        actor.goals = lambda seeds: perform(stage, seeds)[0][:, -1]
+        actor.goals = partial(ends, stage)
+
+
+def ends(pool: TaskPool, seeds: Sequence[int]) -> Tensor:
+    """The frames (E, 3, H, W) uint8 [0, 255] in which the scripted expert's episodes end; no others are drawn."""
+    last = np.zeros((len(seeds), pool.env.image_size, pool.env.image_size, 3), np.uint8)
+
+    def note(moment: Moment) -> None:
+        if moment.step == pool.env.max_steps:
+            last[moment.episodes] = moment.frames
+        for task in pool.take(len(moment.episodes)):
+            task.draw_steps = moment.step == pool.env.max_steps - 1
+
+    run_episodes(pool, ExpertActor(), seeds, note, stop=False, draw=False)
+    return torch.from_numpy(last).movedim(-1, -3)
 
 
 class ReplayActor(PlannedActor):
