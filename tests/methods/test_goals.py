@@ -29,6 +29,7 @@ from playslot_rl.modules.policy import LatentPolicy
 from playslot_rl.play.session import PlaySession
 from playslot_rl.play.starts import Start
 from playslot_rl.runs import Run
+from playslot_rl.studies.success.measure import check_success
 from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.training.demonstrated import moves
 from playslot_rl.training.fit import Part, fit
@@ -219,6 +220,13 @@ def test_others_are_refused_and_old_sizes_are_the_same() -> None:
             require_told(config, name)
     assert "goal" not in to_dict(PolicyConfig())
     assert to_dict(config.model.policy)["goal"] is True
+
+
+def test_a_comparison_without_an_expert_who_reaches_them_is_refused() -> None:
+    typed = ["preset=smoke", "env=gym", "env.id=FetchReach-v4", "data.demos=x", "env.action_dim=4"]
+    config = compose([*typed, "model.policy.goal=true", "methods=playslot"], "compare")
+    with pytest.raises(ConfigError, match=r"env\.expert: got nothing with env\.id=FetchReach-v4"):
+        check_success(config)
 
 
 MADE = {
