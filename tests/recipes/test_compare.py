@@ -128,6 +128,14 @@ def test_two_world_models_on_a_test_block_drawn_once(shared_run: Path, tmp_path:
     assert len(prints) == 4, "two SAVis and two models of LAPO"
     assert [row["runs"] for row in found["summary"]] == [2, 2]
     assert [row["method"] for row in found["differences"]] == ["slot_oracle"]
+    other, named = tmp_path / "other", f"baselines.lapo.world={out / 'lapo_world'}"
+    taking = _arguments(shared_run, other, "methods=lapo", "demos=2")
+    done = playslot(*taking, f"baselines.lapo.world={tmp_path}")
+    assert (done.code, "lapo_model" in done.err) == (1, True)
+    assert not other.exists(), "nothing was computed"
+    assert playslot(*taking, named).code == 0
+    assert not (other / "lapo_world").exists()
+    assert _result(other)["latent_models"] == {"lapo_model": found["latent_models"]["lapo_model"][:1]}
     assert (before["block"]["kind"], before["summary"][0]["runs"]) == ("development", 1)
 
     started.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.jobs import (
     SuccessJob,
     model_folder,
+    model_named,
     success_config,
     success_jobs,
     success_record,
@@ -74,7 +76,16 @@ def test_a_job_takes_the_model_and_the_shared_policy_of_its_own_number() -> None
     own = success_config(compared("methods=lapo", "labels=5,10", "demos=100"), job, "w2")
     assert own.baselines.lapo.world == str((OUT / "lapo_world_2").resolve())  # type: ignore[attr-defined]
     assert Path(own.behaviour.policy_from).name == "lapo-d100-l5-w2-s0"
-    assert model_folder(OUT, "lapo_model") == OUT / "lapo_world"
+    config = compared("methods=lapo", "demos=100", "baselines.lapo.world=runs/other")
+    for of, first in ((compared("methods=lapo", "demos=100"), OUT / "lapo_world"), (config, Path("runs/other"))):
+        found = [model_folder(of, "lapo_model", OUT, number) for number in (0, 1)]
+        assert found == [first, OUT / "lapo_world_1"]
+    taken = success_config(config, replace(job, world=0), "w0").baselines.lapo
+    assert taken.world == str(Path("runs/other").resolve())  # type: ignore[attr-defined]
+    assert (
+        model_named(compared("methods=caddy_policy,caddy_oracle", "demos=9", "baselines.caddy_policy.world=a"), "caddy")
+        == "a"
+    )
     assert success_record(job, own, {})["world"] == 2
 
 

@@ -152,9 +152,17 @@ def latent_models(config: ExperimentConfig) -> dict[str, str]:
     return {model.name: name for name in config.compare.methods if (model := shared_model(config, name))}
 
 
-def model_folder(out: Path, stage: str, world: int = 0) -> Path:
-    """Run folder of such a model in a comparison: `OUT/lapo_world`, `OUT/caddy_world`, `OUT/lapo_world_1`."""
-    return numbered(out / f"{stage.removesuffix('_model')}_world", world)
+def model_named(config: ExperimentConfig, stage: str) -> str:
+    """Run whose model of videos of that stage the comparison takes (`baselines.METHOD.world`), or empty."""
+    sharing = [method.name for method in METHODS.values() if method.model and method.model.name == stage]
+    groups = [getattr(config.baselines, name, None) for name in sharing]
+    return next((named for group in groups if (named := getattr(group, "world", ""))), "")
+
+
+def model_folder(config: ExperimentConfig, stage: str, out: Path, world: int = 0) -> Path:
+    """Run folder of such a model: the named one, else `OUT/lapo_world`, `OUT/caddy_world`; then `OUT/lapo_world_1`."""
+    named = model_named(config, stage)
+    return Path(named) if named and not world else numbered(out / f"{stage.removesuffix('_model')}_world", world)
 
 
 def numbered(folder: Path, world: int) -> Path:
@@ -176,7 +184,7 @@ def success_config(config: ExperimentConfig, job: SuccessJob, world: str) -> Exp
     policy = "" if job.policy_of is None else absolute(str(replace(job, labels=job.policy_of).run))
     own = {}
     if model := shared_model(config, job.method):
-        world_of = absolute(str(model_folder(job.out, model.name, job.world)))
+        world_of = absolute(str(model_folder(config, model.name, job.out, job.world)))
         own = {job.method: replace(getattr(config.baselines, job.method), world=world_of)}
     draw = None if job.online else job.seed
     return replace(
@@ -278,8 +286,8 @@ def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
     for method in models.values():
         stage = shared_model(config, method)
         assert stage is not None
-        for number in range(config.compare.worlds):
-            train_model(_of_world(config, method, number), stage, model_folder(out, stage.name, number))
+        for number in range(1 if model_named(config, stage.name) else 0, config.compare.worlds):
+            train_model(_of_world(config, method, number), stage, model_folder(config, stage.name, out, number))
     return config
 
 
@@ -347,7 +355,9 @@ class Shared:
         runs = world_runs(config) if uses_slots(config) else ()
         self._worlds = [(_source(run), _parts(config, run)) for run in runs]
         self._models = {
-            stage: [Run(model_folder(Path(config.out), stage, n)).own(stage) for n in range(config.compare.worlds)]
+            stage: [
+                Run(model_folder(config, stage, Path(config.out), n)).own(stage) for n in range(config.compare.worlds)
+            ]
             for stage in latent_models(config)
         }
         prints = [tuple(stage.fingerprint for stage in stages.values()) for _, stages in self._worlds]

@@ -29,6 +29,8 @@ from playslot_rl.studies.success.jobs import (
     Shared,
     SuccessJob,
     check_data,
+    latent_models,
+    model_named,
     prepare_shared,
     success_config,
     success_jobs,
@@ -235,6 +237,9 @@ def check_success(config: ExperimentConfig) -> None:
         require_told(config, method)
         check_method(config, method)
     task_results(config, [env.full_name])
+    for stage in latent_models(config):
+        if named := model_named(config, stage):
+            Run.open(named).own(stage)
     for run in world_runs(config) if uses_slots(config) else ():
         for checkpoint in map(Run.open(run).stage, world_parts(config.compare.methods)) if run else ():
             sizes = ("image_size",) if env.name in RECORDED else ("image_size", "action_dim")  # videos have no actions
