@@ -23,6 +23,11 @@ def main(config: ExperimentConfig) -> None:
     if not config.out or folder.resolve() == Path(config.run).resolve():
         raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
     require_one_task(config, "export")
+    if config.model.policy.goal:
+        raise ConfigError(
+            f"model.policy.goal: got true in run={config.run}, expected a policy that is shown no goal images: "
+            "`playslot export` has none; use evaluate or plan"
+        )
     if not METHODS[config.method].imagines:
         raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")
     from playslot_rl.sharing.folder import is_model_folder

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.config.env import in_turn
+from playslot_rl.config.planning import PlanConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.frames import normalise
 from playslot_rl.modules.action_decoder import ActionDecoder
@@ -29,8 +30,6 @@ from playslot_rl.world_model import action_decoder_module, frame_parser_module, 
 
 RANDOM_STREAM: Final = 7
 """Keeps random actions apart from the environment's own stream of the same seed."""
-LOOKS: Final = 2
-"""Times that a goal image is shown to SAVi, as `plan.looks`."""
 Goals = Callable[[Sequence[int]], Tensor]
 """Seeds of n episodes to their goal images (n, 3, H, W) uint8 [0, 255]."""
 
@@ -126,6 +125,12 @@ def goal_slots(savi: SAVi, state: Tensor, goal: Tensor, looks: int = 1) -> Tenso
     return slots[:, -1]
 
 
+def put_goals(savi: SAVi, seen: TensorDictBase, fresh: Tensor, looks: int) -> None:
+    """Find GOAL_SLOTS of the rows, bool (n,), whose first frame SAVi has just seen."""
+    state, goal = seen.get(keys.SLOT_STATE)[fresh], seen.get(keys.GOAL_PIXELS)[fresh]
+    put_rows(seen, fresh, {keys.GOAL_SLOTS: goal_slots(savi, state, goal, looks)})
+
+
 class SlotActor(Actor):
     """Frame to slots by SAVi, whose recurrent state is the memory; slots (n, N, D) to ACTION (n, A) by the heads.
 
@@ -160,8 +165,7 @@ class SlotActor(Actor):
         seen: TensorDictBase = self.parser(tensordict)
         fresh = seen.get(keys.SLOT_AGE).squeeze(-1) == 1
         if self.shown_goals and bool(fresh.any()):
-            state, goal = seen.get(keys.SLOT_STATE)[fresh], seen.get(keys.GOAL_PIXELS)[fresh]
-            put_rows(seen, fresh, {keys.GOAL_SLOTS: goal_slots(self.parser.module.savi, state, goal, LOOKS)})
+            put_goals(self.parser.module.savi, seen, fresh, PlanConfig.looks)
         return seen
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -16,10 +16,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import LOOKS, Actor, ExpertActor, PlannedActor, SlotActor, goal_slots, put_rows
+from playslot_rl.acting.actor import Actor, ExpertActor, PlannedActor, SlotActor, goal_slots, put_rows
 from playslot_rl.acting.belief import BeliefActor
 from playslot_rl.acting.episodes import Moment, TaskPool, record, run_episodes
 from playslot_rl.acting.imagination import ImaginationEnv
+from playslot_rl.config.planning import PlanConfig
 from playslot_rl.frames import normalise
 from playslot_rl.modules.policy import told_keys
 from playslot_rl.world_model import Agent, action_decoder_module, latent_policy_module, observed_keys, oracle_module
@@ -107,7 +108,7 @@ class ImaginationActor(PlannedActor):
             return first.select(*observed_keys(self.agent.policy, keys.PIXELS))
         savi = self.agent.world_model.savi
         slots, state = savi(normalise(first[keys.PIXELS])[:, None], generator=self._generator)
-        goal = goal_slots(savi, state, first[keys.GOAL_PIXELS], LOOKS)
+        goal = goal_slots(savi, state, first[keys.GOAL_PIXELS], PlanConfig.looks)
         return TensorDict({keys.SLOTS: slots[:, 0], keys.GOAL_SLOTS: goal}, first.batch_size)
 
 

@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, Goals, goal_slots, put_rows
+from playslot_rl.acting.actor import Actor, Goals, put_goals, put_rows
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.planners import Cost, Planner, Search, SearchSize, latent_statistics, shifted
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance
@@ -80,10 +80,7 @@ class PlanningActor(Actor):
         tensordict.set(keys.SLOT_HISTORY, history)
         steps = step.flatten().tolist()
         if 0 in steps:
-            fresh = step.squeeze(-1) == 0
-            state, goal = tensordict.get(keys.SLOT_STATE), tensordict.get(keys.GOAL_PIXELS)
-            parsed = goal_slots(self.agent.world_model.savi, state[fresh], goal[fresh], self.config.looks)
-            put_rows(tensordict, fresh, {keys.GOAL_SLOTS: parsed})
+            put_goals(self.agent.world_model.savi, tensordict, step.squeeze(-1) == 0, self.config.looks)
         for row, at in enumerate(steps):
             if at % self.size.every == 0:
                 self._plan(tensordict, row, at)

@@ -125,8 +125,8 @@ def acted(actor: Actor, source: EpisodeFrames, seeds: Sequence[int]) -> npt.NDAr
     """What an actor would do at each row, in the units of the data set, (F, A); NaN where no transition begins."""
     width = source.require_actions().shape[1]
     found = np.full((len(source.frames), width), np.nan, np.float32)
-    last = dict(zip(seeds, source.starts + source.lengths - 1, strict=True))
     if actor.shown_goals:
+        last = dict(zip(seeds, source.starts + source.lengths - 1, strict=True))
         actor.goals = lambda some: source.pixels(np.array([last[seed] for seed in some])).to(actor.device)
     for first in range(0, source.episodes, AT_ONCE):
         starts, steps = (part[first : first + AT_ONCE] for part in (source.starts, source.lengths - 1))

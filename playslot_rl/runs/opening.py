@@ -104,16 +104,11 @@ def require_task(config: ExperimentConfig, trained: EnvConfig, names: Sequence[s
 
 
 def require_one_task(config: ExperimentConfig, command: str) -> None:
-    """Refuse a policy that is told what to do, by a ConfigError: a command that cannot tell it."""
+    """Refuse several tasks in one, by a ConfigError: a command that cannot tell a policy which."""
     if config.env.tasks:
         raise ConfigError(
             f"env.task={config.env.task}: got {len(config.env.tasks)} tasks, expected one: `playslot {command}` cannot "
             "tell a policy which; use evaluate"
-        )
-    if config.model.policy.goal and command != "plan":
-        raise ConfigError(
-            f"model.policy.goal: got true in run={config.run}, expected a policy that is shown no goal images: `playslot "
-            f"{command}` has none; use evaluate or plan"
         )
 
 
