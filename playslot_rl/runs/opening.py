@@ -112,6 +112,15 @@ def require_one_task(config: ExperimentConfig, command: str) -> None:
         )
 
 
+def require_no_goal(config: ExperimentConfig, command: str) -> None:
+    """Refuse a policy that is shown goal images, by a ConfigError: a command that has none."""
+    if config.model.policy.goal:
+        raise ConfigError(
+            f"model.policy.goal: got true in run={config.run}, expected a policy that is shown no goal images: `playslot "
+            f"{command}` has none; use evaluate or plan"
+        )
+
+
 def require_parent(config: ExperimentConfig, run: Run, parent: StageCheckpoint, *sizes: str) -> None:
     """Check that a parent is of the task's `image_size` or `action_dim`, and that a run can build on it and has no
     other; else a CheckpointError.
