@@ -69,6 +69,15 @@ class Clips:
         """At most `shown` disjoint windows of episodes: row indices (at most `shown`, T)."""
         return spread_windows(self.source.starts, self.source.lengths, self.frames, self.shown, episodes)
 
+    def scenes(self, most: int = 16) -> list[IntArray]:
+        """Spread windows of the training episodes of each scene, a task before a camera, in which a clip fits; of the
+        `most` scenes with the most episodes.
+        """
+        there = self.train_episodes[self.source.lengths[self.train_episodes] >= self.frames]
+        scenes, of, episodes = np.unique(self.source.scenes[there], return_inverse=True, return_counts=True)
+        chosen = np.sort(np.argsort(-episodes, kind="stable")[:most])
+        return [self.spread(there[of == scene]) for scene in chosen]
+
     def sample(self, batch: int, generator: np.random.Generator) -> IntArray:
         """Row indices (batch, T) of windows of the training episodes, drawn uniformly; of sets with weights
         (`playslot_rl.data.weighted`), uniformly in a set that was drawn by its weight; of streams

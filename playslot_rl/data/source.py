@@ -120,6 +120,17 @@ class EpisodeFrames:
         return found
 
     @property
+    def scenes(self) -> npt.NDArray[np.int64]:
+        """Number of what each shows, a task before a camera, int64 (E,)."""
+        order = np.argsort(self.numbers, kind="stable")
+        first = np.searchsorted(self.numbers[order], self.numbers[order])
+        view = np.empty_like(order)
+        view[order] = np.arange(self.episodes) - first
+        tasks = np.zeros_like(view) if self.tasks is None else np.unique(self.tasks, return_inverse=True)[1]
+        found: npt.NDArray[np.int64] = tasks * (view.max() + 1) + view
+        return found
+
+    @property
     def silent(self) -> npt.NDArray[np.bool_]:
         """Which episodes have no actions though others have some, bool (E,)."""
         if self.actions is None or not self.unlabelled:

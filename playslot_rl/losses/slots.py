@@ -7,12 +7,12 @@ With a motion weight lambda and a foreground weight mu, what is of interest coun
     L = mean_b  sum_{t,p} w_{b,t,p} (o - o^)^2 / sum_{t,p} w_{b,t,p},   w = 1 + lambda m + mu f
 
 where m_{b,t,p} is 1 where the pixel changes from the frame before or to the one after, and f_{b,t,p} where it is not
-that of the background b_p, the median of frames of the videos, else 0: a goal that lies still moves in no clip.
+that of the clip's background, the median of frames of its scene, else 0: a goal that lies still moves in no clip.
 
 Note: the paper has lambda = mu = 0. Small things over a ground that stays are a few hundredths of the plain error, and
 SAVi learns the ground alone for a long time.
 
-Shapes: B batch, T frames, H W image height and width.
+Shapes: B batch, T frames, K scenes, H W image height and width.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class SlotsLoss(LossModule):
         savi: the model that is trained.
         motion_weight: lambda.
         foreground_weight: mu.
-        background: frame (3, H, W) in [0, 1], from `background`; needed where mu is not 0.
+        backgrounds: frames (K, 3, H, W) in [0, 1], each from `background`; needed where mu is not 0.
 
     Raises:
-        ValueError: mu, but no background.
+        ValueError: mu, but no backgrounds.
 
     Examples:
         >>> from playslot_rl.testing import tiny_agent
@@ -72,16 +72,16 @@ class SlotsLoss(LossModule):
         savi: SAVi,
         motion_weight: float = 0.0,
         foreground_weight: float = 0.0,
-        background: Tensor | None = None,
+        backgrounds: Tensor | None = None,
     ) -> None:
         super().__init__()
-        if foreground_weight and background is None:
+        if foreground_weight and backgrounds is None:
             raise ValueError(
-                f"SlotsLoss: got foreground_weight={foreground_weight:g} without a background, expected one: give what "
-                "`losses.slots.background` makes of some frames"
+                f"SlotsLoss: got foreground_weight={foreground_weight:g} without backgrounds, expected one or more: "
+                "give what `losses.slots.background` makes of some frames of each scene"
             )
         self.savi, self.motion_weight, self.foreground_weight = savi, motion_weight, foreground_weight
-        self.background = background
+        self.backgrounds = backgrounds
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -95,8 +95,8 @@ class SlotsLoss(LossModule):
         loss = mse
         if self.motion_weight or self.foreground_weight:
             weight = 1.0 + self.motion_weight * moving(frames)
-            if self.background is not None:
-                weight = weight + self.foreground_weight * foreground(frames, self.background)
+            if self.backgrounds is not None:
+                weight = weight + self.foreground_weight * foreground(frames, self.backgrounds)
             loss = ((weight * error.mean(2)).sum((1, 2, 3)) / weight.sum((1, 2, 3))).mean()
         return TensorDict({"loss_reconstruction": loss, "psnr": batch_psnr(mse)}, [])
 
@@ -123,6 +123,9 @@ def background(frames: Tensor) -> Tensor:
     return normalise(frames.flatten(0, -4)).median(0).values
 
 
-def foreground(frames: Tensor, background: Tensor) -> Tensor:
-    """1 where a pixel is not the background's (3, H, W), else 0: (B, T, H, W) of (B, T, 3, H, W)."""
-    return moves(frames - background).squeeze(2).to(frames.dtype)
+def foreground(frames: Tensor, backgrounds: Tensor) -> Tensor:
+    """1 where a pixel is not the background's, else 0: (B, T, H, W) of (B, T, 3, H, W). Of the backgrounds (K, 3, H, W)
+    a clip's is the one from which its first frame differs in the fewest pixels.
+    """
+    scene = moves(frames[:, :1] - backgrounds).sum((2, 3, 4)).argmin(1)
+    return moves(frames - backgrounds[scene][:, None]).squeeze(2).to(frames.dtype)

@@ -44,11 +44,9 @@ class SlotsStage:
     ) -> None:
         self.savi, self.clips, self.config, self.device = savi, clips, config, module_device(savi)
         self.segmented = segmented
-        usual = (
-            background(clips.pixels(clips.spread(clips.train_episodes), self.device))
-            if config.foreground_weight
-            else None
-        )
+        usual = None
+        if config.foreground_weight:
+            usual = torch.stack([background(clips.pixels(rows, self.device)) for rows in clips.scenes()])
         self.criterion = SlotsLoss(savi, config.motion_weight, config.foreground_weight, usual)
         self.magnified = SlotsLoss(savi, config.motion_weight)  # magnified frames have another background
 

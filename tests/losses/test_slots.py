@@ -77,7 +77,7 @@ def test_what_lies_still_counts_more_where_it_is_not_the_background() -> None:
     frames[0, :, 0, 4:8, 10] = 0.9  # a goal
     usual = background(frames)
     assert torch.equal(usual, frames[1, 0])
-    found = foreground(frames, usual)
+    found = foreground(frames, usual[None])
     assert (found[0, :, 4:8, 10] == 1).all()
     assert (found.sum((2, 3)) == torch.tensor([[4.0, 4.0], [0.0, 0.0], [0.0, 0.0]])).all()
     assert moving(frames).sum() == 0
@@ -85,9 +85,21 @@ def test_what_lies_still_counts_more_where_it_is_not_the_background() -> None:
     error = (savi.decode(savi(frames)[0]).frames - frames).square().mean(2)
     of_goal, rest = error[0][found[0] > 0].sum(), error[0][found[0] == 0].sum()
     first = (10 * of_goal + rest) / (10 * 8 + error[0].numel() - 8)
-    loss = SlotsLoss(savi, foreground_weight=9.0, background=usual)
+    loss = SlotsLoss(savi, foreground_weight=9.0, backgrounds=usual[None])
     weighted = loss(TensorDict({keys.PIXELS: frames}, [3]))
     torch.testing.assert_close(weighted["loss_reconstruction"], (first + error[1].mean() + error[2].mean()) / 3)
+
+
+def test_the_background_is_that_of_the_clips_own_scene() -> None:
+    scenes = torch.full((2, 3, 3, 8, 8), 0.5)
+    scenes[1, :, :, 3:] = 0.9  # another table
+    frames = scenes.repeat_interleave(2, 0)
+    frames[::2, :, :, 1, 1] = 0.0  # a goal, in every second clip of each
+    found = foreground(frames, torch.stack([background(scene) for scene in scenes]))
+    assert (found[::2, :, 1, 1] == 1).all()
+    assert (found.sum((2, 3)) == torch.tensor([1.0, 0.0, 1.0, 0.0])[:, None]).all()
+    of_both = foreground(frames, background(scenes)[None])
+    assert of_both.mean((1, 2, 3)).amax() > 0.5  # what tells the scenes apart hides the goal
 
 
 def test_nothing_moves_in_a_clip_of_one_frame() -> None:
@@ -95,5 +107,5 @@ def test_nothing_moves_in_a_clip_of_one_frame() -> None:
 
 
 def test_a_foreground_needs_a_background() -> None:
-    with pytest.raises(ValueError, match="got foreground_weight=30 without a background"):
+    with pytest.raises(ValueError, match="got foreground_weight=30 without backgrounds"):
         SlotsLoss(tiny_agent().world_model.savi, foreground_weight=30.0)
