@@ -69,14 +69,15 @@ class Clips:
         """At most `shown` disjoint windows of episodes: row indices (at most `shown`, T)."""
         return spread_windows(self.source.starts, self.source.lengths, self.frames, self.shown, episodes)
 
-    def scenes(self, most: int = 16) -> list[IntArray]:
-        """Spread windows of the training episodes of each scene, a task before a camera, in which a clip fits; of the
-        `most` scenes with the most episodes.
+    def scenes(self, least: int = 8, most: int = 16) -> list[IntArray]:
+        """Spread windows of the training episodes of each scene, a task before a camera. Scenes of fewer episodes than
+        `least` are one, with those beyond the `most` that have the most: a median of few shows what lies in them.
         """
         there = self.train_episodes[self.source.lengths[self.train_episodes] >= self.frames]
-        scenes, of, episodes = np.unique(self.source.scenes[there], return_inverse=True, return_counts=True)
-        chosen = np.sort(np.argsort(-episodes, kind="stable")[:most])
-        return [self.spread(there[of == scene]) for scene in chosen]
+        of, episodes = np.unique(self.source.scenes[there], return_inverse=True, return_counts=True)[1:]
+        large = np.argsort(-episodes, kind="stable")[: min(most, int((episodes >= least).sum()))]
+        parts = [there[of == scene] for scene in np.sort(large)] + [there[~np.isin(of, large)]]
+        return [self.spread(part) for part in parts if len(part)]
 
     def sample(self, batch: int, generator: np.random.Generator) -> IntArray:
         """Row indices (batch, T) of windows of the training episodes, drawn uniformly; of sets with weights

@@ -49,6 +49,32 @@ def recorded(source: EpisodeFrames) -> set[int]:
     return {episode for episode, _ in views(source)}
 
 
+def of_two_tasks(source: EpisodeFrames) -> EpisodeFrames:
+    """Episodes 0 to 2 push, 3 to 7 reach."""
+    return replace(source, tasks=np.where(source.numbers > 2, "reach", "push"))
+
+
+def test_a_scene_is_a_task_before_a_camera(both: EpisodeFrames) -> None:
+    assert len(set(seen_by(1).scenes)) == 1
+    told = of_two_tasks(both)
+    shown = [{(e > 2, camera) for e, camera in views(told, np.flatnonzero(told.scenes == n))} for n in set(told.scenes)]
+    assert sorted(map(sorted, shown)) == [[(False, 1)], [(False, 2)], [(True, 1)], [(True, 2)]]
+
+
+def test_clips_of_a_scene_are_its_own_and_scenes_of_few_episodes_are_one(both: EpisodeFrames) -> None:
+    clips = Clips(of_two_tasks(both), 2, 0.0, 0)  # two episodes of two frames push, five reach
+
+    def shown(least: int, most: int = 16) -> list[list[tuple[bool, int]]]:
+        parts = [np.unique(both.frames[rows]).tolist() for rows in clips.scenes(least, most)]
+        return [sorted({(value >= 30, value % 10) for value in part}) for part in parts]
+
+    push, reach = [(False, 1), (False, 2)], [(True, 1), (True, 2)]
+    assert shown(2) == [[scene] for scene in push + reach]
+    assert shown(3) == [[scene] for scene in reach] + [push]
+    assert shown(2, 1) == [reach[:1], push + reach[1:]]
+    assert shown(8) == [push + reach]
+
+
 def test_both_views_of_an_episode_lie_on_one_side_of_validation(both: EpisodeFrames) -> None:
     for seed in range(10):
         clips = Clips(both, 1, 0.3, seed)
