@@ -24,7 +24,8 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
     Observations are `pixels`, `{"front": uint8 [0, 255] (H, W, 3)}`, and `agent_pos`, float32 (S,); actions float32
     (A,) in [-1, 1]. `info["is_success"]` says whether the agent step solved the task, and then the episode ends, as
     LeRobot's own environments do. (Ours go on: clips of a data set have a fixed length, `max_steps` agent steps.)
-    `metadata` has `render_fps`, agent steps a second (`control_hz / frame_skip`).
+    `task_description` is what is to be done, of several tasks in the present episode. `metadata` has `render_fps`,
+    agent steps a second (`control_hz / frame_skip`).
     """
 
     def __init__(self, env: EnvConfig | str | None = None, render: RenderConfig | None = None) -> None:
@@ -44,6 +45,9 @@ class LeRobotTask(gym.Wrapper[Observation, npt.NDArray[np.float32], Any, npt.NDA
     ) -> tuple[Observation, dict[str, Any]]:
         """Start the episode of `seed`; see the task's own `reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
+        if self._config.tasks:
+            episode = self._config.of_episode(self.env.get_wrapper_attr("episode"))
+            self.task_description = str(task_metadata(episode)["task"])
         return _named(observation), {"is_success": bool(info["success"])}
 
     def step(self, action: npt.NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

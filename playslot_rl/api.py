@@ -26,6 +26,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from playslot_rl.acting.actor import told_as
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop, resized
 from playslot_rl.acting.imagination import ImaginationEnv, ImaginationSession, Reward, latent_actions
@@ -269,13 +270,18 @@ class PlaySlot:
         out: npt.NDArray[np.float32] = self._loop.actor.executed(chosen).numpy()
         return out
 
-    def reset(self, goal: Array | None = None) -> None:
-        """Forget the episode: the next frame `act` gets is a first one. `goal` is the image, (H, W, 3) or (3, H, W),
-        that a policy of `model.policy.goal=true` is to reach, until another is given; a ValueError for other shapes, or
-        for a policy that is shown none.
+    def reset(self, goal: Array | None = None, task: str | None = None) -> None:
+        """Forget the episode: the next frame `act` gets is a first one. `task` is what a policy of several is to do, by
+        its name or as the data say it, `goal` the image, (H, W, 3) or (3, H, W), that one of `model.policy.goal=true`
+        is to reach; both until others are given. A ValueError for other tasks or shapes, or for a policy that is told
+        or shown none.
         """
         if self._loop is None:
             return
+        if task is not None:
+            if not self._loop.actor.tasks:
+                raise ValueError(f"task: got {task!r} for a policy that is told none, expected nothing")
+            self._loop.actor.tells = told_as(self.world_model.env, [task])
         if goal is not None:
             actor, image = self._loop.actor, self._frames(goal)
             if not actor.shown_goals or image.ndim != 3:

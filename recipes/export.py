@@ -9,7 +9,7 @@ from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import ConfigError, OutputError
 from playslot_rl.recipes import evaluate
-from playslot_rl.runs.opening import require_no_goal, require_one_task
+from playslot_rl.runs.opening import require_no_goal
 
 
 def main(config: ExperimentConfig) -> None:
@@ -22,7 +22,6 @@ def main(config: ExperimentConfig) -> None:
     run, folder = evaluate.run_with_policy(replace(config, out="")), Path(config.out)
     if not config.out or folder.resolve() == Path(config.run).resolve():
         raise ConfigError("out: got nothing or the run itself, expected a new folder, such as out=policies/press")
-    require_one_task(config, "export")
     require_no_goal(config, "export")
     if not METHODS[config.method].imagines:
         raise ConfigError(f"run={config.run}: got a run of method={config.method}, expected one of PlaySlot")

@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 
 from playslot_rl import keys
-from playslot_rl.config.env import in_turn
+from playslot_rl.config.env import EnvConfig, in_turn
 from playslot_rl.config.planning import PlanConfig
 from playslot_rl.errors import ConfigError
 from playslot_rl.frames import normalise
@@ -30,8 +30,8 @@ from playslot_rl.world_model import action_decoder_module, frame_parser_module, 
 
 RANDOM_STREAM: Final = 7
 """Keeps random actions apart from the environment's own stream of the same seed."""
-Goals = Callable[[Sequence[int]], Tensor]
-"""Seeds of n episodes to their goal images (n, 3, H, W) uint8 [0, 255]."""
+OfEpisodes = Callable[[Sequence[int]], Tensor]
+"""Seeds of n episodes to what is told of each, (n, ...)."""
 
 
 class Actor(TensorDictModuleBase):
@@ -44,13 +44,15 @@ class Actor(TensorDictModuleBase):
     (n, 3, H, W), as `goals` gives them.
 
     Attributes:
-        goals: of episodes, for who is shown one; whoever runs it sets them.
+        goals: goal images (n, 3, H, W) uint8 [0, 255], for who is shown one; whoever runs it sets them.
+        tells: which of the tasks, int64 (n, 1); None: by the seeds.
         looks: at which frames: `always`, `first` (it never sees what its actions did) or `never`. Frames that nobody
             looks at need not be drawn.
     """
 
     looks: Literal["always", "first", "never"] = "always"
-    goals: Goals | None = None
+    goals: OfEpisodes | None = None
+    tells: OfEpisodes | None = None
 
     def __init__(
         self, memory: Sequence[str] = (), reads: Sequence[str] = (keys.PIXELS,), tasks: int = 0, goal: bool = False
@@ -81,6 +83,8 @@ class Actor(TensorDictModuleBase):
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""
         memory = TensorDict(told(seeds, self.tasks), [len(seeds)], device=self.device)
+        if self.tasks and self.tells is not None:
+            memory[keys.TASK] = self.tells(seeds)
         if self.shown_goals:
             if self.goals is None:
                 raise ConfigError(
@@ -112,6 +116,12 @@ def with_present(history: Tensor, present: Tensor, step: Tensor) -> Tensor:
 def told(seeds: Sequence[int], tasks: int) -> dict[str, Tensor]:
     """TASK (n, 1) of episodes, as `EnvConfig.of_episode`; nothing of one task."""
     return {keys.TASK: torch.tensor([[in_turn(seed, tasks)] for seed in seeds])} if tasks else {}
+
+
+def told_as(env: EnvConfig, said: Sequence[str]) -> OfEpisodes:
+    """Which of the tasks episodes are of, by what is said of each, or of all (`EnvConfig.number_of`)."""
+    numbers = torch.tensor([[env.number_of(task)] for task in said])
+    return lambda seeds: numbers.expand(len(seeds), 1)
 
 
 @torch.no_grad()

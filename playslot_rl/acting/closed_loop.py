@@ -41,8 +41,10 @@ class ClosedLoop:
         """
         memory = self._memory
         if memory is None:
-            if keys.TASK in self.actor.memory_keys:
-                raise ConfigError("act: got episodes of a policy of several tasks, expected reset(seeds) to tell which")
+            if self.actor.tasks and self.actor.tells is None:
+                raise ConfigError(
+                    "act: got a policy of several tasks, expected to be told which: reset(task=...) first"
+                )
             self.reset([self._seed] * len(observation))
             return self.step(observation, rows)
         some = rows is not None and len(rows) < len(memory)

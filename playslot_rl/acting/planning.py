@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from playslot_rl import keys
-from playslot_rl.acting.actor import Actor, Goals, put_goals, put_rows
+from playslot_rl.acting.actor import Actor, OfEpisodes, put_goals, put_rows
 from playslot_rl.acting.agent import imagine
 from playslot_rl.acting.planners import Cost, Planner, Search, SearchSize, latent_statistics, shifted
 from playslot_rl.acting.planners.costs import GoalCost, NearProposal, goal_distance
@@ -40,7 +40,7 @@ class PlanningActor(Actor):
         planner: Planner,
         plan: PlanConfig,
         size: SearchSize,
-        goals: Goals,
+        goals: OfEpisodes,
         policy: bool = False,
         seed: int = 0,
     ) -> None:

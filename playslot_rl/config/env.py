@@ -7,10 +7,12 @@ from typing import Final, Literal
 
 from playslot_rl.config import metaworld
 from playslot_rl.config.families import FAMILIES, OGBENCH, OGBENCH_GOALS, member, own_camera, task_name
-from playslot_rl.config.plain import check
+from playslot_rl.config.plain import check, nearest
 from playslot_rl.config.roles import SEED, UNSAID, Checked, at_least, between, within
 
 Rgb = tuple[int, int, int]
+VIDEO: Final = "video"
+"""`env=video`: what somebody recorded, without a simulator."""
 
 STRENGTH: Final = between(0, 1, "0 (off) to 1")
 
@@ -153,14 +155,14 @@ class EnvConfig(Checked):
         blocks: settings of the `block_*` environments.
         variation: what changes in the picture and not in the task.
         id: of `env=gym`: a registered Gymnasium environment, `FetchReach-v4`, or `package:Id` after importing one.
-        camera: of `env=gym` with MuJoCo, and `metaworld`: a camera's name, or `distance,azimuth,elevation,x,y,z`; empty
-            is its own. Meta-World's tasks with small things have `near`.
+        camera: of `env=gym` with MuJoCo, and `metaworld`: a name, or `distance,azimuth,elevation,x,y,z`; empty is its
+            own. Meta-World's tasks with small things have `near`.
         expert: of `env=gym`, typed `expert=`: `package.module:function`, from its own observation, info and a generator
             to its action.
         success: of `env=gym`: the entry of its info that says success; empty is `is_success` or `success`.
-        task: which task of `metaworld`: `drawer-open`, another of its fifty, or several by the episode, `MT10` or
-            `reach+push`; of `ogbench`: `cube-single` or `cube-double`.
-        goals: of `ogbench`: its five of `evaluation`, in turn, or `random` ones one after the other, as in its data.
+        task: of `metaworld`: `drawer-open`, another of its fifty, or several, `MT10` or `reach+push`; of `ogbench`:
+            `cube-single` or `cube-double`; of `video`: several that sets name, `Open it.+Close it.`
+        goals: of `ogbench`: its five of `evaluation`, in turn, or `random` ones, as in its data.
         targets: of `ogbench`: whether they are drawn, translucent; its `visual-` environments hide them.
     """
 
@@ -190,7 +192,15 @@ class EnvConfig(Checked):
     @property
     def sentences(self) -> tuple[str, ...]:
         """What is to be done in each of `tasks`, as data sets say it."""
-        return tuple(metaworld.TASKS[name].sentence for name in self.tasks)
+        return self.tasks if self.name == VIDEO else tuple(metaworld.TASKS[name].sentence for name in self.tasks)
+
+    def number_of(self, said: str) -> int:
+        """Which of `tasks` is meant, by its name or what data sets say; a ValueError where none is."""
+        for known in (self.tasks, self.sentences):
+            if said in known:
+                return known.index(said)
+        close = nearest(said, [*self.tasks, *self.sentences])
+        raise ValueError(f"task: got {said!r}, expected one of {len(self.tasks)}: {', '.join(self.tasks)}{close}")
 
     @property
     def other_sentences(self) -> set[str]:
@@ -200,8 +210,11 @@ class EnvConfig(Checked):
         return {task.sentence for task in FAMILIES[self.name].tasks.values()} - {member(self.name, self.task).sentence}
 
     def serves(self, env: EnvConfig) -> bool:
-        """Whether a world model of this task is one of another, too: the same, or one of several."""
-        return env.typed in (self.typed, *(self._alone(task).typed for task in self.tasks if task == env.task))
+        """Whether a world model of this task is one of another, too: the same, one of several, or any of videos."""
+        return self.name == env.name == VIDEO or env.typed in (
+            self.typed,
+            *(self._alone(task).typed for task in self.tasks if task == env.task),
+        )
 
     def of_episode(self, seed: int) -> EnvConfig:
         """The task of several whose an episode is: each in turn by the seed; else itself."""
@@ -223,7 +236,7 @@ class EnvConfig(Checked):
     @property
     def full_name(self) -> str:
         """The name, the task where that has several, and what varies, as folders and reports call it."""
-        own = self.task or self.id.replace("/", "_").replace(":", "_")
+        own = (self.task if self.name in FAMILIES else "") or self.id.replace("/", "_").replace(":", "_")
         return "_".join((self.name, *([own] if own else []), *self.variation.words))
 
     @property
@@ -240,15 +253,17 @@ class EnvConfig(Checked):
             check(self.name == "gym" or not value, f"env.{key}", value, f"none with env={self.name}: it is of env=gym")
         seen = self.name in ("gym", metaworld.NAME) or not self.camera
         check(seen, "env.camera", self.camera, f"none with env={self.name}: it is of env=gym and env={metaworld.NAME}")
-        drawn = self.name not in ("grid_shapes", "sketchy", "video") or not self.variation.on
+        drawn = self.name not in ("grid_shapes", "sketchy", VIDEO) or not self.variation.on
         check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
         if self.name in FAMILIES:
             object.__setattr__(self, "task", task_name(self.name, self.task))
             alone, small = metaworld.seen_by(self.task, self.camera), ", ".join(metaworld.SMALL)
             check(self.camera == alone, "env.camera", self.camera, f"none with env.task={self.task}: it is of {small}")
         else:
+            told = self.name == VIDEO and all(self.tasks) and 1 < len(self.tasks) == len({*self.tasks})
             known = ", ".join(f"env={name}" for name in FAMILIES)
-            check(not self.task, "env.task", self.task, f"none with env.name={self.name}: it is for {known}")
+            rest = ", or several that the sets name, joined by +" if self.name == VIDEO else f": it is for {known}"
+            check(told or not self.task, "env.task", self.task, f"none with env.name={self.name}{rest}")
         plain = self.goals == "evaluation" and self.targets
         cube = f"nothing with env={self.name}: they are of env={OGBENCH}"
         check(self.name == OGBENCH or plain, "env.goals, env.targets", (self.goals, self.targets), cube)

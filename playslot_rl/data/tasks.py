@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from playslot_rl.config import EnvConfig
+from playslot_rl.config.env import VIDEO
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import recorded_tasks
@@ -43,14 +44,15 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
     if unknown:
         raise DataError(
             f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
-            "collect them with it"
+            + ("name it, too, or other sets" if env.name == VIDEO else "collect them with it")
         )
     tasks = sorted(said - {""})
     if not env.tasks and len(tasks) > 1:
         say_once(
             f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
-            "one policy is not told apart: train on those of one, a set that `playslot dataset split` makes without "
-            "--fractions"
+            "one policy is not told apart: "
+            + ("tell it which by env.task=, all joined by +, or " if env.name == VIDEO else "")
+            + "train on those of one, a set that `playslot dataset split` makes without --fractions"
         )
 
 

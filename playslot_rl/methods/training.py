@@ -100,8 +100,9 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
             require_parent(config, run, parents["dynamics"], "action_dim")
         elif config.env.action_dim == env.action_dim:  # nothing was typed, and unlabelled videos do not say it
             config = _with_width(StageRecord(spec, run.folder, config))
-        one_of_several = env.tasks and env.serves(config.env)
-        groups["env"] = config.env if one_of_several else replace(env, action_dim=config.env.action_dim)
+        groups["env"] = replace(env, action_dim=config.env.action_dim)
+        if env.serves(config.env):  # one of its tasks, or several of videos
+            groups["env"] = config.env if env.tasks else replace(groups["env"], task=config.env.task)
     else:
         groups["model"] = replace(config.model, savi=parents["slots"].sizes[0].savi)
     if spec.sizes:

@@ -4,6 +4,7 @@ it again (`playslot_rl.sharing.commands`).
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from string import Template
@@ -86,6 +87,7 @@ def make_card(
         data=facts_table(_data(policy.source)),
         results=_results(results),
         use=use(policy, experiment),
+        told=f"task={json.dumps(policy.told[0], ensure_ascii=False)}" if policy.told else "",
         frames=f"for each frame of an episode, uint8 (H, W, 3); {rate_words(policy)}",
         commands=commands,
         versions=facts_table(versions),
@@ -117,8 +119,12 @@ def _task(policy: SharedPolicyConfig) -> dict[str, str]:
     tasks = policy.source.get("tasks", [])
     others = f" and {len(tasks) - SHOWN} others" if len(tasks) > SHOWN else ""
     steps = {} if env.name in RECORDED else {"agent steps": f"at most {env.max_steps} an episode{rate}"}
+    told = (
+        {"told": "which of these, by `reset(task=...)`, or by LeRobot's `task` in these words"} if policy.told else {}
+    )
     return {
-        "task": words or "; ".join(tasks[:SHOWN]) + others or "not described",
+        "task": "; ".join(policy.told) or words or "; ".join(tasks[:SHOWN]) + others or "not described",
+        **told,
         "camera": f"`{policy.camera}`, {side} RGB; frames of another size are {other}",
         "frames": rate_words(policy),
         "action": f"`{keys.FEATURE_ACTION}`, {numbers}" + (f": {action}" if action else ""),

@@ -199,7 +199,9 @@ def rate_words(policy: SharedPolicyConfig) -> str:
 def _real(policy: SharedPolicyConfig, why: str) -> str:
     """How a robot runs it, and why LeRobot has no simulator for it."""
     told = f" `lerobot-rollout` needs `--fps={policy.fps:g}`: its own is 30." if policy.fps else ""
-    return REAL.format(why=why, camera=policy.camera, rate=rate_words(policy), told=told)
+    told += f" Its `--task=` says which: `--task={shlex.quote(policy.told[0])}`." if policy.told else ""
+    task = f', "task": {json.dumps(policy.told[0], ensure_ascii=False)}' if policy.told else ""
+    return REAL.format(why=why, camera=policy.camera, rate=rate_words(policy), told=told, task=task)
 
 
 def use(policy: SharedPolicyConfig, experiment: ExperimentConfig | None = None) -> str:
@@ -248,5 +250,5 @@ from lerobot_policy_playslot.modeling_playslot import PlaySlotPolicy
 policy = PlaySlotPolicy.from_pretrained("THIS_FOLDER")
 before, after = make_pre_post_processors(policy.config, "THIS_FOLDER")
 policy.reset()
-action = after(policy.select_action(before({{"{camera}": picture}})))  # picture (3, H, W), float in [0, 1]
+action = after(policy.select_action(before({{"{camera}": picture{task}}})))  # picture (3, H, W), float in [0, 1]
 ```"""

@@ -78,6 +78,11 @@ class SharedPolicyConfig:
     source: dict[str, Any] = field(default_factory=dict)
     actions: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def told(self) -> tuple[str, ...]:
+        """What it can be told to do, in the words of the data sets; empty where it has one task."""
+        return () if self.model.policy.goal else self.env.sentences
+
     def features(self) -> tuple[dict[str, dict[str, Any]], dict[str, dict[str, Any]]]:
         """LeRobot's input and output features; shapes are (3, H, W) and (A,)."""
         side = self.env.image_size

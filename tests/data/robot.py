@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,10 @@ def write_robot(
     size: int = 64,
     labelled: bool = True,
     states: bool = False,
+    tasks: Sequence[str] = ("reach",),
 ) -> Path:
     """A data set of a square that moves with the first two joints, by LeRobot's writer; its actions, if `labelled`,
-    and as many `states`."""
+    and as many `states`; its episodes are of the tasks by turns."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     actions = robot_actions() if actions is None else actions
@@ -58,14 +60,14 @@ def write_robot(
     if states:
         features["observation.state"] = {"dtype": "float32", "shape": (width,), "names": None}
     dataset = LeRobotDataset.create("me/arm", fps=10, features=features, root=root, robot_type=robot, use_videos=False)
-    for episode in actions:
+    for number, episode in enumerate(actions):
         for a in episode:
             frame = np.full((size, size, 3), 40, np.uint8)
             x, y = (int(size / 2 + np.clip(v, -200, 200) / 200 * size / 3) for v in np.asarray(a[:2], float))
             frame[y - 5 : y + 5, x - 5 : x + 5] = (220, 60, 30)
             own = {"action": a} if labelled else {}
             own |= {"observation.state": a.astype(np.float32)} if states else {}
-            dataset.add_frame({CAMERA: frame, "task": "reach"} | own)
+            dataset.add_frame({CAMERA: frame, "task": tasks[number % len(tasks)]} | own)
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     return root

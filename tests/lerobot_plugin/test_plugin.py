@@ -17,14 +17,14 @@ import torch
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig
-from playslot_rl.envs import task_env
+from playslot_rl.envs import task_config, task_env
 
 # The evaluation's imports first: MuJoCo has to find its GL backend before LeRobot imports anything that imports it.
 from playslot_rl.envs.lerobot import LeRobotTask, frames_a_second
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.sharing.folder import FILES, SharedPolicyConfig, save_pretrained
 from playslot_rl.storage.atomic import write_json
-from playslot_rl.testing import tiny_agent
+from playslot_rl.testing import tiny_agent, tiny_config
 
 SEED = 1_000_000_000
 
@@ -141,6 +141,42 @@ def test_reset_forgets_the_episode(loaded: tuple[Any, Any, Any]) -> None:
     policy.reset()
     assert torch.equal(policy.select_action({"front": next(iter(batch.values()))}), first), "renamed to the short name"
     policy.reset()
+
+
+TWO = "metaworld/reach+drawer-open"
+
+
+def test_a_policy_of_several_tasks_does_what_lerobot_says(tmp_path: Path) -> None:
+    from lerobot_policy_playslot.modeling_playslot import PlaySlotPolicy
+
+    agent = tiny_agent(replace(tiny_config(), env=task_config(TWO)))
+    env = agent.world_model.env
+    config = SharedPolicyConfig(env=env, model=agent.world_model.config)
+    save_pretrained(agent, tmp_path / "policy", config, lambda _: "card\n")
+    policy, ours = PlaySlotPolicy.from_pretrained(tmp_path / "policy"), ClosedLoop(playslot_actor(agent))
+    frames = torch.rand(1, 3, 64, 64).expand(2, -1, -1, -1)
+    ours.reset([0, 1])
+    expected = ours.act(frames)
+    assert (expected[0] - expected[1]).abs().max() > 1e-5
+    for said, tasks in (([*env.sentences], [0, 1]), (env.sentences[1], [1, 1]), (["reach"], [0, 0])):
+        policy.reset()
+        acted = policy.select_action({"observation.images.front": frames, "task": said})
+        torch.testing.assert_close(acted, expected[tasks], rtol=0, atol=1e-6)
+    for batch in ({}, {"task": ["", ""]}):
+        policy.reset()
+        with pytest.raises(ValueError, match=r"task: got '', expected one of 2: reach, drawer-open"):
+            policy.select_action({"observation.images.front": frames, **batch})
+
+
+@pytest.mark.integration
+def test_an_environment_of_several_tasks_says_what_to_do() -> None:
+    env = LeRobotTask(task_config(TWO))
+    try:
+        for seed in (SEED, SEED + 1, SEED):
+            env.reset(seed=seed)
+            assert env.get_wrapper_attr("task_description") == task_config(TWO).sentences[seed % 2]
+    finally:
+        env.close()
 
 
 def test_what_does_not_fit_is_refused(folder: Path, loaded: tuple[Any, Any, Any]) -> None:

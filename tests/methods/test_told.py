@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from playslot_rl import keys
+from playslot_rl import PlaySlot, keys
 from playslot_rl.acting.agent import ImaginationActor, oracle_actor, playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.acting.episodes import Outcome
@@ -79,9 +79,24 @@ def test_imagination_is_of_the_task(agent: Agent) -> None:
     imagines_by(agent, keys.TASK, torch.tensor([[2], [7]]))
 
 
-def test_act_without_seeds_is_refused(agent: Agent) -> None:
-    with pytest.raises(ConfigError, match=r"expected reset\(seeds\)"):
-        ClosedLoop(playslot_actor(agent)).act(torch.rand(1, 3, 64, 64))
+def test_reset_says_what_to_do(agent: Agent) -> None:
+    model, env = PlaySlot(agent.world_model, agent), agent.world_model.env
+    frame = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(ConfigError, match=r"act: got a policy of several tasks, expected to be told which"):
+        model.act(frame)
+    expected = ClosedLoop(playslot_actor(agent).eval(), 64)
+    expected.reset(range(10))
+    actions = expected.act(frame.expand(10, -1, -1, -1)).numpy()
+    for number, (name, sentence) in enumerate(zip(env.tasks, env.sentences, strict=True)):
+        for said in (name, sentence, None):  # once told, it stays
+            model.reset(task=said)
+            np.testing.assert_allclose(model.act(frame), actions[number], atol=1e-6)
+    with pytest.raises(
+        ValueError, match=r"task: got 'reac', expected one of 10: reach, push, .*; did you mean reach\?"
+    ):
+        model.reset(task="reac")
+    with pytest.raises(ValueError, match=r"task: got 'reach' for a policy that is told none, expected nothing"):
+        PlaySlot.untrained().reset(task="reach")
 
 
 def test_who_plays_cannot_tell_it_and_plans(agent: Agent) -> None:
@@ -171,6 +186,9 @@ def test_who_clones_several_tasks_untold_is_told_so(capsys: pytest.CaptureFixtur
     said = capsys.readouterr().err
     assert said.startswith("note: kitchen: got demonstrations of 2 tasks ('Cook.', 'Wash up.', ...)")
     assert said.count("\n") == 1
+    assert "env.task" not in said
+    require_tasks(source, EnvConfig(name="video"))
+    assert "not told apart: tell it which by env.task=, all joined by +, or train on" in capsys.readouterr().err
 
 
 def test_tasks_without_a_label_are_named(capsys: pytest.CaptureFixture[str]) -> None:
@@ -246,7 +264,7 @@ def test_success_is_told_by_task() -> None:
 @pytest.mark.integration
 @pytest.mark.slow
 def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
-    run, demos = tmp_path / "run", tmp_path / "demos"
+    run, demos, sentences = tmp_path / "run", tmp_path / "demos", task_config("metaworld/MT10").sentences
     every = ("demos=10", "behaviour.labelled_demos=10")  # one of each task: of others without a label a note says so
     smoke("collect", *MADE, "policy=expert", "episodes=11", f"out={demos}")
     smoke("train-slots", *MADE, f"data.root={demos}", f"out={run}")
@@ -257,7 +275,8 @@ def test_commands_from_videos_to_success_of_each_task(tmp_path: Path) -> None:
     assert "| peg-insert-side | 0 % |" in (run / "report.md").read_text()
     refused("evaluate", f"run={run}", "env.task=drawer-open", message=r"env\.task: got drawer-open, expected MT10")
     refused("plan", f"run={run}", message="got 10 tasks, expected one")
-    refused("export", f"run={run}", f"out={tmp_path / 'new'}", message="got 10 tasks, expected one")
+    smoke("export", f"run={run}", f"out={tmp_path / 'new'}")
+    assert f'policy.reset(task="{sentences[0]}")' in (tmp_path / "new" / "README.md").read_text()
     refused("train-policy", f"run={run}", f"out={tmp_path / 'one'}", "env.task=push", f"data.demos={demos}",
             message=r"got demonstrations of '.*', expected the tasks of env\.task=push alone")  # fmt: skip
     pushes, one = tmp_path / "pushes", tmp_path / "pushing"

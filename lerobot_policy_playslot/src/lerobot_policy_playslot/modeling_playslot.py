@@ -9,6 +9,7 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_policy_playslot.configuration_playslot import NOT_TRAINED_HERE, PlaySlotConfig
+from playslot_rl.acting.actor import told_as
 from playslot_rl.acting.agent import playslot_actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.sharing.folder import WEIGHTS, build_agent, load_weights, require_range, write_weights
@@ -39,8 +40,9 @@ class PlaySlotPolicy(PreTrainedPolicy):
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Actions (B, A) in [-1, 1] for the frames of the policy's camera, float (B, 3, H, W) in [0, 1]; LeRobot's
-        postprocessor gives them in the robot's units. A ValueError where there is no such camera, for frames of another
-        shape or range, and for another number of environments without a `reset`.
+        postprocessor gives them in the robot's units. What a policy of several tasks is to do is read of `task`, of
+        each environment or of all, at the first frames after a `reset`. A ValueError where there is no such camera or
+        task, for frames of another shape or range, and for another number of environments without a `reset`.
         """
         del kwargs
         self.eval()  # as LeRobot's own policies do
@@ -56,6 +58,9 @@ class PlaySlotPolicy(PreTrainedPolicy):
         if frames.is_floating_point() and not bool(((frames >= 0) & (frames <= 1)).all()):
             low, high = frames.min().item(), frames.max().item()
             raise ValueError(f"{camera}: got floats in [{low:g}, {high:g}], expected [0, 1]: divide bytes by 255")
+        if self._loop.actor.tasks:
+            said: Any = batch.get("task", "")
+            self._loop.actor.tells = told_as(self.policy_config.env, [said] if isinstance(said, str) else said)
         return self._loop.act(frames, camera)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
