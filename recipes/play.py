@@ -45,14 +45,13 @@ def open_studio(config: ExperimentConfig) -> Studio:
     run = Run.of(config)
     model = load(run, str(open_device(config.device, config.threads)), config.seed)
     world = model.world_model
-    agent = None if world.env.tasks else model.agent  # nobody tells it which
-    recorded, simulated = recorded_starts(config, run, world, agent), simulated_starts(config, world)
+    recorded, simulated = recorded_starts(config, run, world, model.agent), simulated_starts(config, world)
     if recorded is None and simulated is None:
         print("no data set and no simulator to start from: upload a picture, or give data.root=", flush=True)
     kept = bool(config.out) and not is_model_folder(Path(config.out))  # nothing is written into an exported policy
     out = Path(config.out if kept else "runs") / "play"
     return Studio(
-        world, agent, recorded, simulated, out, config.run, config.play.fps,
+        world, model.agent, recorded, simulated, out, config.run, config.play.fps,
         squeezes=config.data.resize, horizon=predicted_frames(run), camera=run_camera(config, recorded),
     )  # fmt: skip
 

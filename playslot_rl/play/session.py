@@ -20,7 +20,7 @@ from playslot_rl.acting.imagination import ImaginationSession
 from playslot_rl.frames import to_uint8
 from playslot_rl.modules.savi.health import owners
 from playslot_rl.play.starts import Start
-from playslot_rl.play.steering import Driver, PlannerDriver, PolicyDriver, require_prototypes, variability_directions
+from playslot_rl.play.steering import Driver, PlannerDriver, policy_drivers, require_prototypes, variability_directions
 from playslot_rl.play.timeline import Frame, SceneMoment, Timeline
 from playslot_rl.runtime.captured import Captured
 from playslot_rl.world_model import Agent, WorldModel
@@ -59,9 +59,7 @@ class PlaySession:
         self.planner: PlannerDriver | None = None
         if agent is not None:
             self.planner = PlannerDriver(agent)
-            self.drivers["planner"] = self.planner
-            if not agent.policy.tasks:  # nobody says which
-                self.drivers = {"policy": PolicyDriver(agent.policy, self.planner), **self.drivers}
+            self.drivers = {**policy_drivers(agent, self.planner), "planner": self.planner}
         self._imagination = ImaginationSession(world_model)
         self._decode = Captured(world_model.savi.decode, world_model.savi)
         self._look: tuple[int, Look] | None = None

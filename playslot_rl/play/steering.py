@@ -51,19 +51,33 @@ class Driver(Protocol):
 
 class PolicyDriver:
     """The latent policy: slots (..., N, D) to a latent action (..., Z), in evaluation mode; one that is shown goals
-    heads for the planner's.
+    heads for the planner's, one of several tasks is told the `task` of this number.
     """
 
     title = "latent policy"
 
-    def __init__(self, policy: LatentPolicy, planner: PlannerDriver) -> None:
-        self.policy, self.planner = policy, planner
+    def __init__(self, policy: LatentPolicy, planner: PlannerDriver, task: int | None = None) -> None:
+        self.policy, self.planner, self.task = policy, planner, task
 
     @torch.no_grad()
     def choose(self, session: PlaySession) -> Tensor:
+        slots = (_whole(session) if self.policy.goal else session.slots)[None]
         told = [self.planner.marked()[None]] if self.policy.goal else []
-        chosen: Tensor = self.policy((_whole(session) if told else session.slots)[None], *told)[0]
+        if self.task is not None:
+            told = [torch.tensor([[self.task]], device=slots.device)]
+        chosen: Tensor = self.policy(slots, *told)[0]
         return chosen
+
+
+def policy_drivers(agent: Agent, planner: PlannerDriver) -> dict[str, Driver]:
+    """The latent policy, by name; of several tasks one for each."""
+    if not agent.policy.tasks:
+        return {"policy": PolicyDriver(agent.policy, planner)}
+    drivers: dict[str, Driver] = {}
+    for number, task in enumerate(agent.world_model.env.tasks):
+        drivers[f"policy: {task}"] = driver = PolicyDriver(agent.policy, planner, number)
+        driver.title = f"latent policy: {task}"
+    return drivers
 
 
 def require_prototypes(model: WorldModel) -> Tensor:

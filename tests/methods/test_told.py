@@ -99,11 +99,16 @@ def test_reset_says_what_to_do(agent: Agent) -> None:
         PlaySlot.untrained().reset(task="reach")
 
 
-def test_who_plays_cannot_tell_it_and_plans(agent: Agent) -> None:
+def test_who_plays_hands_over_to_the_policy_of_a_task_or_plans(agent: Agent) -> None:
     session = PlaySession(agent.world_model, agent)
-    assert list(session.drivers) == ["planner"]
+    assert list(session.drivers) == [*(f"policy: {task}" for task in MT10), "planner"]
     assert session.planner is not None
     session.begin(Start("", np.zeros((64, 64, 3), np.uint8), torch.randn(1, 4, 32)))
+    slots = session.slots[None]
+    for number in (2, 7):
+        driver = session.drivers[f"policy: {MT10[number]}"]
+        torch.testing.assert_close(driver.choose(session), agent.policy(slots, torch.tensor([[number]]))[0])
+    assert session.drive("policy: push").label == "latent policy: push"
     session.planner.aim(session)
     assert session.planner.choose(session).shape == agent.world_model.latent_shape
 

@@ -20,6 +20,7 @@ from scene import DotTask
 
 from playslot_rl.config import ExperimentConfig, to_dict
 from playslot_rl.config.experiment import DataConfig
+from playslot_rl.envs import task_config
 from playslot_rl.errors import ConfigError, DataError
 from playslot_rl.play.page import PlayPage
 from playslot_rl.play.pictures import Gallery
@@ -28,6 +29,7 @@ from playslot_rl.play.starts import RecordedStarts
 from playslot_rl.play.studio import Studio
 from playslot_rl.recipes import play
 from playslot_rl.runs import Run
+from playslot_rl.testing import tiny_agent, tiny_config
 from playslot_rl.world_model import Agent
 
 pytestmark = pytest.mark.integration
@@ -84,6 +86,20 @@ def test_the_planner_steers_to_the_moment_that_goal_was_pressed_at(studio: Studi
         page.controls.free.set_value(False)
 
     simulate(studio, script)
+
+
+@pytest.mark.parametrize("tasks", ["reach+push", "MT10"])
+def test_the_policy_of_several_tasks_takes_over_for_one(tasks: str, studio: Studio) -> None:
+    told = tiny_agent(replace(tiny_config(), env=task_config(f"metaworld/{tasks}")))
+
+    async def script(user: User, pages: list[PlayPage]) -> None:
+        page = pages[0]
+        page.controls.hand.set_value("policy: push")
+        await until(lambda: page.session.now.depth >= 1)
+        assert page.session.now.label == "latent policy: push"
+        page.controls.free.set_value(False)
+
+    simulate(replace(studio, world_model=told.world_model, agent=told), script)
 
 
 def test_the_policy_takes_over_until_a_key_takes_back(studio: Studio) -> None:
