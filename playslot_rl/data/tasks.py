@@ -5,6 +5,7 @@ Shapes: M transitions.
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.env import VIDEO
+from playslot_rl.config.metaworld import JOINT
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.views import recorded_tasks
@@ -51,7 +53,7 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
         say_once(
             f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
             "one policy is not told apart: "
-            + ("tell it which by env.task=, all joined by +, or " if env.name == VIDEO else "")
+            + (f"tell it which by {shlex.quote('env.task=' + JOINT.join(tasks))}, or " if env.name == VIDEO else "")
             + "train on those of one, a set that `playslot dataset split` makes without --fractions"
         )
 

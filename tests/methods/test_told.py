@@ -193,7 +193,7 @@ def test_who_clones_several_tasks_untold_is_told_so(capsys: pytest.CaptureFixtur
     assert said.count("\n") == 1
     assert "env.task" not in said
     require_tasks(source, EnvConfig(name="video"))
-    assert "not told apart: tell it which by env.task=, all joined by +, or train on" in capsys.readouterr().err
+    assert "not told apart: tell it which by 'env.task=Cook.+Wash up.', or train on" in capsys.readouterr().err
 
 
 def test_tasks_without_a_label_are_named(capsys: pytest.CaptureFixture[str]) -> None:
