@@ -55,14 +55,14 @@ from playslot_rl.training.stage_regression import (
 
 class Seen(NamedTuple):
     """Transitions: what the policy reads of the frame before each, the latents (M, Z) that the model infers, the real
-    actions (M, A) in [-1, 1], which they are, and the task int64 (M, 1) where it is told, which `inputs` end with.
+    actions (M, A) in [-1, 1], which they are, and what it is told (`Demonstrations.told`), which `inputs` end with.
     """
 
     inputs: Inputs
     latents: Tensor
     actions: Tensor
     moves: Transitions
-    task: Tensor | None
+    told: Tensor | None
 
 
 def sizes(config: ExperimentConfig, model: ModelConfig) -> ModelConfig:
@@ -105,6 +105,7 @@ class LatentCloning(ABC):
         loss: Literal["l2", "l1"],
     ) -> None:
         self.config, self.device, self.schedule, self.loss = config, device, schedule, loss
+        self.said = "goal" if config.model.policy.goal else "task"  # of `Demonstrations`
         self.copies = shifted_copies(demos.trained, shift, len(DIRECTIONS))
         self.trained = self._seen(demos.trained, shift)
         self.labelled = labelled_rows(self.trained.moves.episode, config.behaviour.labelled_demos)
@@ -179,7 +180,7 @@ class LatentCloning(ABC):
         demos, moved = self._decided(self.trained, labelled), self.trained.moves.rows[labelled.cpu().numpy()]
         every = torch.arange(len(moved), device=self.device)
         frames = [self.observe(FrameInputs(copy, moved, self.device, resident=False)) for copy in self.copies]
-        features = [apply_rows(self.policy.features, PairedInputs.told(part, demos.task), every) for part in frames]
+        features = [apply_rows(self.policy.features, PairedInputs.told(part, demos.told), every) for part in frames]
         shown, none = torch.cat((demos.slots, *features)), demos.slots[:, :0]  # what is taken apart is not copied
         taken = replace(demos, slots=none, imagined=none).take(every.repeat(1 + len(frames)))
         return replace(taken, slots=shown, imagined=shown)
@@ -189,8 +190,11 @@ class LatentCloning(ABC):
         rows, moves = rows.to(self.device), seen.moves
         features = apply_rows(self.policy.features, seen.inputs, rows)
         episode, step = (torch.from_numpy(part).to(self.device)[rows] for part in (moves.episode, moves.step))
-        lengths, task = torch.from_numpy(moves.lengths), None if seen.task is None else seen.task[rows]
-        return Demonstrations(features, features, seen.latents[rows], seen.actions[rows], episode, step, lengths, task)
+        told = {} if seen.told is None else {self.said: seen.told[rows]}
+        lengths = torch.from_numpy(moves.lengths)
+        return Demonstrations(
+            features, features, seen.latents[rows], seen.actions[rows], episode, step, lengths, **told
+        )
 
 
 @torch.no_grad()

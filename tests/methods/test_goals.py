@@ -22,6 +22,7 @@ from playslot_rl.config.compose import compose
 from playslot_rl.config.methods import METHODS, require_told
 from playslot_rl.config.plain import to_dict
 from playslot_rl.config.planning import PlanConfig
+from playslot_rl.config.plugins import call
 from playslot_rl.data.demonstrations import label_demonstrations, transitions
 from playslot_rl.errors import ConfigError
 from playslot_rl.evaluation.success import evaluate
@@ -36,7 +37,7 @@ from tests.methods.told_examples import imagines_by
 from tests.recipes.commands import refused, smoke
 from tests.training.tiny_stages import videos
 
-SHOWN = ("playslot", "slot_oracle", "slot_bc", "slot_vpt")
+SHOWN = ("playslot", "slot_oracle", "slot_bc", "slot_vpt", "lapo_slots")
 
 
 def of_goals(gain: float = 1.0) -> Agent:
@@ -206,7 +207,15 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 @pytest.mark.parametrize("method", SHOWN)
 def test_commands_from_videos_to_goals(method: str, recorded: tuple[str, Path, Path], tmp_path: Path) -> None:
     (name, run, demos), own, out = recorded, METHODS[method], tmp_path / "run"
-    typed = ["preset=smoke", f"data.demos={demos}", "demos=4", "data.held_out=2", f"out={out}", *MADE[name]]
+    typed = [
+        "preset=smoke",
+        f"data.root={demos}",
+        f"data.demos={demos}",
+        "demos=4",
+        "data.held_out=2",
+        f"out={out}",
+        *MADE[name],
+    ]
     typed += [f"run={run}", *(["behaviour.labelled_demos=2"] if own.some_labelled else []), "model.policy.goal=true"]
     smoke("train-policy" if method == "playslot" else "train-baseline", *typed, f"method={method}")
     assert Run.open(out).own(own.last.name).sizes[0].policy.goal
@@ -216,6 +225,13 @@ def test_commands_from_videos_to_goals(method: str, recorded: tuple[str, Path, P
         assert (out / "report.md").is_file()
     done = smoke("evaluate", f"run={out}", "protocol=actions", f"data.demos={demos}")
     assert "R²" in done.out or "r2" in done.out.lower()
+    actor, (goals, frame) = call(own.load.actor, Run(out), torch.device("cpu")), (pictures(2), pictures(1, seed=1))
+    actor.goals = lambda seeds: goals[[seed % 2 for seed in seeds]]
+    loop = ClosedLoop(actor)
+    loop.reset([0, 1, 2])
+    actions = loop.step(TensorDict({keys.PIXELS: frame.expand(3, -1, -1, -1)}, [3]))[keys.ACTION]
+    assert not torch.equal(actions[0], actions[1])
+    torch.testing.assert_close(actions[0], actions[2])
     if name == "one" and method == "playslot":
         refused("export", f"run={out}", f"out={tmp_path / 'new'}", message=r"model\.policy\.goal: got true")
         smoke("plan", f"run={out}", "episodes=2", "planner=cem", "proposal=policy", "goals=ahead", "plan.ahead=5",

@@ -48,5 +48,5 @@ POLICY: Final = StageSpec(
 )  # fmt: skip
 LAPO_SLOTS: Final = Method(
     NAME, ("LAPO on slots",), Style(5, "$S$"), LAPOSlotsConfig, (MODEL, POLICY),
-    Load(actor="playslot_rl.methods.lapo.slots:load_actor"), told="task",
+    Load(actor="playslot_rl.methods.lapo.slots:load_actor"), told="goal",
 )  # fmt: skip
