@@ -273,21 +273,21 @@ class PlaySlot:
     def reset(self, goal: Array | None = None, task: str | None = None) -> None:
         """Forget the episode: the next frame `act` gets is a first one. `task` is what a policy of several is to do, by
         its name or as the data say it, `goal` the image, (H, W, 3) or (3, H, W), that one of `model.policy.goal=true`
-        is to reach; both until others are given. A ValueError for other tasks or shapes, or for a policy that is told
-        or shown none.
+        is to reach; both until others are given. Without a policy nothing happens. A ValueError for other tasks or
+        shapes, or for a policy that is told or shown none.
         """
         if self._loop is None:
             return
+        actor, image = self._loop.actor, None if goal is None else self._frames(goal)
+        if image is not None and (not actor.shown_goals or image.ndim != 3):
+            got = f"shape {tuple(image.shape)}" if actor.shown_goals else "an image for a policy that is shown none"
+            expected = "one image" if actor.shown_goals else "nothing, or one trained with model.policy.goal=true"
+            raise ValueError(f"goal: got {got}, expected {expected}")
         if task is not None:
-            if not self._loop.actor.tasks:
+            if not actor.tasks:
                 raise ValueError(f"task: got {task!r} for a policy that is told none, expected nothing")
-            self._loop.actor.tells = told_as(self.world_model.env, [task])
-        if goal is not None:
-            actor, image = self._loop.actor, self._frames(goal)
-            if not actor.shown_goals or image.ndim != 3:
-                got = f"shape {tuple(image.shape)}" if actor.shown_goals else "an image for a policy that is shown none"
-                expected = "one image" if actor.shown_goals else "nothing, or one trained with model.policy.goal=true"
-                raise ValueError(f"goal: got {got}, expected {expected}")
+            actor.tells = told_as(self.world_model.env, [task])
+        if image is not None:
             actor.goals = lambda seeds: quantise(image).expand(len(seeds), -1, -1, -1)
         self._loop.reset()
 

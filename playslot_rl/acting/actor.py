@@ -82,9 +82,9 @@ class Actor(TensorDictModuleBase):
 
     def reset(self, seeds: Sequence[int]) -> TensorDict:
         """The memory of new episodes, batch size [len(seeds)]; whatever is drawn depends on the seeds alone."""
-        memory = TensorDict(told(seeds, self.tasks), [len(seeds)], device=self.device)
-        if self.tasks and self.tells is not None:
-            memory[keys.TASK] = self.tells(seeds)
+        memory = TensorDict({}, [len(seeds)], device=self.device)
+        if self.tasks:
+            memory[keys.TASK] = self.tells(seeds) if self.tells else told(seeds, self.tasks)
         if self.shown_goals:
             if self.goals is None:
                 raise ConfigError(
@@ -113,15 +113,22 @@ def with_present(history: Tensor, present: Tensor, step: Tensor) -> Tensor:
     return torch.where(begins, now, torch.cat((history[:, 1:], now), dim=1))
 
 
-def told(seeds: Sequence[int], tasks: int) -> dict[str, Tensor]:
-    """TASK (n, 1) of episodes, as `EnvConfig.of_episode`; nothing of one task."""
-    return {keys.TASK: torch.tensor([[in_turn(seed, tasks)] for seed in seeds])} if tasks else {}
+def told(seeds: Sequence[int], tasks: int) -> Tensor:
+    """Which of several tasks episodes are of, int64 (n, 1), as `EnvConfig.of_episode`."""
+    return torch.tensor([[in_turn(seed, tasks)] for seed in seeds])
 
 
 def told_as(env: EnvConfig, said: Sequence[str]) -> OfEpisodes:
-    """Which of the tasks episodes are of, by what is said of each, or of all (`EnvConfig.number_of`)."""
+    """Which of the tasks episodes are of, by what is said of each, or of all (`EnvConfig.number_of`); a ValueError for
+    another number of them."""
     numbers = torch.tensor([[env.number_of(task)] for task in said])
-    return lambda seeds: numbers.expand(len(seeds), 1)
+
+    def tells(seeds: Sequence[int]) -> Tensor:
+        if len(numbers) not in (1, len(seeds)):
+            raise ValueError(f"task: got {len(numbers)} for {len(seeds)} episodes, expected one, or one of each")
+        return numbers.expand(len(seeds), 1)
+
+    return tells
 
 
 @torch.no_grad()

@@ -43,7 +43,8 @@ class ClosedLoop:
         if memory is None:
             if self.actor.tasks and self.actor.tells is None:
                 raise ConfigError(
-                    "act: got a policy of several tasks, expected to be told which: reset(task=...) first"
+                    "act: got a policy of several tasks, expected to be told which: PlaySlot.reset(task=...), or "
+                    "reset(seeds), first"
                 )
             self.reset([self._seed] * len(observation))
             return self.step(observation, rows)

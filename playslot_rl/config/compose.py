@@ -48,7 +48,8 @@ CONTINUES: Final = frozenset({"evaluate", "export", "inspect", "plan", "play", "
 VIEWS: Final = frozenset({"train-baseline", "compare"})
 """Commands that with `env=video` read a set as the run that they build on, unless something else is typed."""
 VIEWED: Final = (
-    "preset", "env.image_size", "data.camera", "data.stride", "data.stride_action", "data.resize", "data.held_out",
+    "preset", "env.image_size", "env.task", "data.camera", "data.stride", "data.stride_action", "data.resize",
+    "data.held_out",
 )  # fmt: skip
 COMPARISONS: Final = {
     "compare": ("envs", "methods", "demos", "labels", "videos", "worlds", "seeds", "processes"),

@@ -187,6 +187,8 @@ class EnvConfig(Checked):
     @property
     def tasks(self) -> tuple[str, ...]:
         """Of several tasks in one, their names; empty of one."""
+        if self.name == VIDEO:
+            return tuple(part.strip() for part in self.task.split(metaworld.JOINT)) if self.task else ()
         return metaworld.several(self.task)
 
     @property
@@ -199,8 +201,8 @@ class EnvConfig(Checked):
         for known in (self.tasks, self.sentences):
             if said in known:
                 return known.index(said)
-        close = nearest(said, [*self.tasks, *self.sentences])
-        raise ValueError(f"task: got {said!r}, expected one of {len(self.tasks)}: {', '.join(self.tasks)}{close}")
+        close, some = nearest(said, [*self.tasks, *self.sentences]), ", ".join(self.tasks[:10])
+        raise ValueError(f"task: got {said!r}, expected one of {len(self.tasks)}: {some}{close}")
 
     @property
     def other_sentences(self) -> set[str]:

@@ -105,7 +105,7 @@ class SlotsStageConfig(StageConfig):
         clip_frames: frames per clip.
         start_from: run (or `pretrained/ENV`) whose SAVi it starts from; empty is scratch (paper).
         motion_weight: so many times more counts a pixel that moves; 0 (paper) not.
-        foreground_weight: so many times more counts a pixel that is not its scene's median; 0 (paper) not.
+        foreground_weight: so many times more counts a pixel that is not its task's median; 0 (paper) not.
         zoom_steps: so many first steps show single frames, magnified (`playslot_rl.data.zoom`); 0 has none.
         zoom: how many times.
         patience: end once the held-out error has not fallen for so many validations, with the weights of the lowest; 0

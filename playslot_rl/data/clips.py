@@ -65,19 +65,23 @@ class Clips:
         """
         return self.pixels(own_rows(self.sample(count, generators.numpy(stream)))[:, :frames], device)
 
-    def spread(self, episodes: IntArray) -> IntArray:
-        """At most `shown` disjoint windows of episodes: row indices (at most `shown`, T)."""
-        return spread_windows(self.source.starts, self.source.lengths, self.frames, self.shown, episodes)
+    def spread(self, episodes: IntArray, count: int | None = None) -> IntArray:
+        """At most `count` (None: `shown`) disjoint windows of episodes: row indices (at most that, T)."""
+        most = self.shown if count is None else count
+        return spread_windows(self.source.starts, self.source.lengths, self.frames, most, episodes)
 
     def scenes(self, least: int = 8, most: int = 16) -> list[IntArray]:
         """Spread windows of the training episodes of each scene, a task before a camera. Scenes of fewer episodes than
-        `least` are one, with those beyond the `most` that have the most: a median of few shows what lies in them.
+        `least` are one, with those beyond the `most` that have the most: a median of few shows what lies in them. Of
+        streams fewer windows are read.
         """
         there = self.train_episodes[self.source.lengths[self.train_episodes] >= self.frames]
         of, episodes = np.unique(self.source.scenes[there], return_inverse=True, return_counts=True)[1:]
         large = np.argsort(-episodes, kind="stable")[: min(most, int((episodes >= least).sum()))]
         parts = [there[of == scene] for scene in np.sort(large)] + [there[~np.isin(of, large)]]
-        return [self.spread(part) for part in parts if len(part)]
+        parts = [part for part in parts if len(part)]
+        count = max(8, self.shown // len(parts)) if streams_of(self.source.frames) else self.shown
+        return [self.spread(part, count) for part in parts]
 
     def sample(self, batch: int, generator: np.random.Generator) -> IntArray:
         """Row indices (batch, T) of windows of the training episodes, drawn uniformly; of sets with weights

@@ -6,7 +6,7 @@ Shapes: M transitions.
 from __future__ import annotations
 
 import shlex
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from playslot_rl.errors import DataError
 
 if TYPE_CHECKING:
     from playslot_rl.data.demonstrations import Transitions
+
+TYPED: Final = 10
+"""Tasks of which a note says what to type."""
 
 
 def told_tasks(source: EpisodeFrames, moves: Transitions, env: EnvConfig) -> Tensor | None:
@@ -46,16 +49,24 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
     if unknown:
         raise DataError(
             f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
-            + ("name it, too, or other sets" if env.name == VIDEO else "collect them with it")
+            + ("name it, too, or leave its episodes out" if env.name == VIDEO else "collect them with it")
         )
     tasks = sorted(said - {""})
     if not env.tasks and len(tasks) > 1:
         say_once(
             f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
             "one policy is not told apart: "
-            + (f"tell it which by {shlex.quote('env.task=' + JOINT.join(tasks))}, or " if env.name == VIDEO else "")
+            + (f"tell it which by {_typed(tasks)}, or " if env.name == VIDEO and _can_be_typed(said) else "")
             + "train on those of one, a set that `playslot dataset split` makes without --fractions"
         )
+
+
+def _can_be_typed(said: set[str]) -> bool:
+    return all(task and JOINT not in task for task in said)
+
+
+def _typed(tasks: list[str]) -> str:
+    return shlex.quote(f"env.task={JOINT.join(tasks)}") if len(tasks) <= TYPED else f"env.task=, all joined by {JOINT}"
 
 
 def say_untaught(source: EpisodeFrames, env: EnvConfig, labelled: int | None) -> None:

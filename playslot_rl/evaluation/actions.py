@@ -99,7 +99,8 @@ def require_unseen(
     met = {name: count for name, count in counts.items() if count}
     if met:
         which = ", ".join(met)
-        cure = f"train {which} with data.held_out={held_out}, too, or name" if held_out else "name"
+        same = f"data.held_out={held_out}{' and the same env.task' * (source.turns)}"
+        cure = f"train {which} with {same}, too, or name" if held_out else "name"
         raise DataError(
             f"data.demos={source.name}: got {max(met.values())} of {source.recordings} episodes that {which} "
             f"{'were' if len(met) > 1 else 'was'} trained on, expected none: {cure} another set by data.demos="

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from playslot_rl.config import ExperimentConfig, plugins
+from playslot_rl.config.env import VIDEO
 from playslot_rl.config.methods import METHODS
 from playslot_rl.config.stage_spec import StageSpec
 from playslot_rl.data.demonstrations import (
@@ -101,8 +102,10 @@ def train_stage(spec: StageSpec, config: ExperimentConfig, run: Run, pace: Pace 
         elif config.env.action_dim == env.action_dim:  # nothing was typed, and unlabelled videos do not say it
             config = _with_width(StageRecord(spec, run.folder, config))
         groups["env"] = replace(env, action_dim=config.env.action_dim)
-        if env.serves(config.env):  # one of its tasks, or several of videos
-            groups["env"] = config.env if env.tasks else replace(groups["env"], task=config.env.task)
+        if env.name == VIDEO:  # a model of videos knows no tasks
+            groups["env"] = replace(groups["env"], task=config.env.task)
+        elif env.tasks and env.serves(config.env):  # maybe one of them
+            groups["env"] = config.env
     else:
         groups["model"] = replace(config.model, savi=parents["slots"].sizes[0].savi)
     if spec.sizes:

@@ -78,8 +78,8 @@ class Controls:
     def _build_drivers(self) -> None:
         page = self.page
         names = {ME: "I steer", **{name: driver.title for name, driver in self.session.drivers.items()}}
-        choice = ui.toggle if len(names) < 5 else ui.select  # of many tasks no row is wide enough
-        self.hand = choice(names, value=ME, on_change=page.on_driver).props("dense no-caps").mark("driver")
+        self.hand = ui.toggle(names, value=ME, on_change=page.on_driver).props("dense no-caps").mark("driver")
+        self.hand.style("flex-wrap: wrap")  # of many tasks no row is wide enough
         if self.session.agent is None:
             ui.label("this model has no policy: playslot train-policy makes one").classes("soft").mark("no-policy")
         if self.session.planner is not None:

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 import torch
 from torch import nn
 
-from playslot_rl.config import ExperimentConfig, to_dict
+from playslot_rl.config import EnvConfig, ExperimentConfig, to_dict
 from playslot_rl.config.plain import put
 from playslot_rl.config.roles import by_default, without
 from playslot_rl.config.stage_spec import StageSpec, group_of
@@ -234,6 +234,8 @@ class StageRecord:
         if self.role == "demos" and self.roots:
             ends = [said(plain if scaled(plain) else None) for plain in (self.actions, done.meta.get("actions"))]
             facts.append(("actions", ends[0], ends[1]))
+        if self.role == "demos" and not self.config.model.policy.goal:
+            facts.append(("env.task", self._group("env").task, done.group(EnvConfig, "env").task))
         for name, got, known in facts:
             if got != known:
                 raise CheckpointError(
@@ -290,6 +292,8 @@ class StageRecord:
             data = {"data": self.data.fingerprint, "data.camera": self.data.camera}
         if self.role == "demos" and scaled(self.actions):
             data["actions"] = said(self.actions)
+        if self.role == "demos" and self._group("env").tasks and not self.config.model.policy.goal:
+            data["env.task"] = self._group("env").task
         if self.labelled is not None:
             data[LABELS] = self.labels
         if self.role == "train":

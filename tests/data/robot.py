@@ -42,7 +42,7 @@ def write_robot(
     tasks: Sequence[str] = ("reach",),
 ) -> Path:
     """A data set of a square that moves with the first two joints, by LeRobot's writer; its actions, if `labelled`,
-    and as many `states`; its episodes are of the tasks by turns."""
+    and as many `states`; its first episodes are of the first of the tasks, and so on."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     actions = robot_actions() if actions is None else actions
@@ -67,7 +67,7 @@ def write_robot(
             frame[y - 5 : y + 5, x - 5 : x + 5] = (220, 60, 30)
             own = {"action": a} if labelled else {}
             own |= {"observation.state": a.astype(np.float32)} if states else {}
-            dataset.add_frame({CAMERA: frame, "task": tasks[number % len(tasks)]} | own)
+            dataset.add_frame({CAMERA: frame, "task": tasks[number * len(tasks) // len(actions)]} | own)
         dataset.save_episode(parallel_encoding=False)
     dataset.finalize()
     return root

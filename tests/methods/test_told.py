@@ -82,7 +82,9 @@ def test_imagination_is_of_the_task(agent: Agent) -> None:
 def test_reset_says_what_to_do(agent: Agent) -> None:
     model, env = PlaySlot(agent.world_model, agent), agent.world_model.env
     frame = torch.rand(3, 64, 64, generator=torch.Generator().manual_seed(0))
-    with pytest.raises(ConfigError, match=r"act: got a policy of several tasks, expected to be told which"):
+    with pytest.raises(
+        ConfigError, match=r"act: got a policy of several tasks, expected to be told which: PlaySlot\.reset"
+    ):
         model.act(frame)
     expected = ClosedLoop(playslot_actor(agent).eval(), 64)
     expected.reset(range(10))
@@ -192,8 +194,14 @@ def test_who_clones_several_tasks_untold_is_told_so(capsys: pytest.CaptureFixtur
     assert said.startswith("note: kitchen: got demonstrations of 2 tasks ('Cook.', 'Wash up.', ...)")
     assert said.count("\n") == 1
     assert "env.task" not in said
-    require_tasks(source, EnvConfig(name="video"))
-    assert "not told apart: tell it which by 'env.task=Cook.+Wash up.', or train on" in capsys.readouterr().err
+    for tasks, cure in (
+        (["Wash up.", "Cook."] * 3, "tell it which by 'env.task=Cook.+Wash up.', or train on"),
+        (["Wash up.", "Cook."] * 2 + ["", ""], "train on those of one"),  # what is not named cannot be typed
+        (["Wash up.", "Cook.", "Mix A + B."] * 2, "train on those of one"),
+    ):
+        say_once.cache_clear()
+        require_tasks(replace(source, tasks=np.array(tasks)), EnvConfig(name="video"))
+        assert f"not told apart: {cure}" in capsys.readouterr().err
 
 
 def test_tasks_without_a_label_are_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import refused, smoke
+from commands import ONE_CORE, instead, playslot, refused, smoke
 from robot import CAMERA, write_robot
 from tensordict import TensorDict
 
@@ -24,15 +24,15 @@ pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("thin_resnets")]
 
 OPEN, CLOSE = "Open the drawer.", "Close the drawer, slowly."
 VIDEO = ("env=video", "env.action_dim=6", "data.held_out=2")
-TOLD = (*VIDEO, f"env.task={OPEN}+{CLOSE}")
+TOLD = (*VIDEO, f"env.task={OPEN} + {CLOSE}")
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A set of two tasks, and a world model of its videos, which knows of none."""
+    """A set of two tasks, one after the other, and a world model of its videos; the last of each are held out."""
     base = tmp_path_factory.mktemp("kitchen")
     root, run = write_robot(base / "set", tasks=(OPEN, CLOSE), states=True), base / "run"
-    smoke("train-slots", *VIDEO, f"data.root={root}", f"out={run}")
+    smoke("train-slots", *TOLD, f"data.root={root}", f"out={run}")
     smoke("train-dynamics", f"run={run}")
     return root, run
 
@@ -51,7 +51,7 @@ def test_from_a_set_of_two_tasks_to_a_robot_that_is_told(recorded: tuple[Path, P
     assert f"policy.reset(task={json.dumps(OPEN)})" in card
     assert f'"{CAMERA}": picture, "task": {json.dumps(OPEN)}' in card
     assert f"`--task='{OPEN}'`" in card
-    assert f"'env.task={OPEN}+{CLOSE}'" in card
+    assert f"'env.task={OPEN} + {CLOSE}'" in card
 
     frame = np.random.default_rng(0).integers(256, size=(64, 64, 3), dtype=np.uint8)
     models, shared = [playslot_rl.load(path) for path in (run, folder)], PlaySlotPolicy.from_pretrained(folder)
@@ -76,12 +76,27 @@ def test_every_method_that_clones_is_told(method: str, recorded: tuple[Path, Pat
     typed += ["behaviour.labelled_demos=2"] if own.some_labelled else []
     smoke("train-policy" if method == "playslot" else "train-baseline", *typed, f"method={method}")
     assert "actions" in smoke("evaluate", f"run={run}", "protocol=actions").out
-    loop = ClosedLoop(call(own.load.actor, Run(run), torch.device("cpu")))
-    loop.reset([0, 1, 2])
-    torch.manual_seed(0)
+    actor = call(own.load.actor, Run(run), torch.device("cpu"))
+    actor.tells = lambda _: torch.tensor([[0], [1], [0]])
+    loop = ClosedLoop(actor)
+    loop.reset([0, 0, 0])  # the same noise for Diffusion Policy
     seen = {keys.PIXELS: torch.rand(1, 3, 64, 64).expand(3, -1, -1, -1), keys.STATE: torch.rand(1, 6).expand(3, -1)}
     actions = loop.step(TensorDict(seen, [3]))[keys.ACTION]
-    assert not torch.equal(actions[0], actions[1])
+    assert (actions[0] - actions[1]).abs().max() > 1e-5
+    torch.testing.assert_close(actions[0], actions[2])
+
+
+def test_what_a_policy_was_told_belongs_to_it(recorded: tuple[Path, Path], tmp_path: Path) -> None:
+    (root, world), out = recorded, f"out={tmp_path / 'run'}"
+    train = ("train-policy", f"run={world}", f"data.demos={root}", "data.held_out=2", out, "behaviour.labelled_demos=2")
+    smoke(*train)  # as its world model's run says
+    assert Run(tmp_path / "run").config.env.sentences == (OPEN, CLOSE)
+    assert "skipped" in smoke(*train).out
+    refused(*train, f"env.task={CLOSE}+{OPEN}", message=r"env\.task: got Close .*, expected Open .*: use another out=")
+    assert playslot(*instead((*train, "preset=smoke", *ONE_CORE), "env.task=")).code == 1
+    untold = f"out={tmp_path / 'untold'}"
+    assert playslot(*instead((*train, "preset=smoke", *ONE_CORE), untold, "env.task=")).code == 0
+    refused("evaluate", f"run={tmp_path / 'untold'}", "protocol=actions", message="train .* with data.held_out=2")
 
 
 def test_tasks_that_no_set_names_are_refused(recorded: tuple[Path, Path], tmp_path: Path) -> None:

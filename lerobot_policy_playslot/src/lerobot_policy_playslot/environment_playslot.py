@@ -28,7 +28,7 @@ class PlaySlotEnv(EnvConfig):
 
     Attributes:
         task: `button_press`, `block_push`, `block_push_easy`, `block_reach`, `block_pick`, or one of Meta-World's or
-            OGBench's, `metaworld/drawer-open`.
+            OGBench's, `metaworld/drawer-open`, or several, `metaworld/reach+push`.
         episode_length: longest episode in agent steps; None takes the task's own.
         frame_skip: environment steps of an agent step; None takes the task's own. A policy that was trained on one
             frame in three acts at a third of the rate: three times as many.

@@ -59,7 +59,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
             low, high = frames.min().item(), frames.max().item()
             raise ValueError(f"{camera}: got floats in [{low:g}, {high:g}], expected [0, 1]: divide bytes by 255")
         if self._loop.actor.tasks:
-            said: Any = batch.get("task", "")
+            said: Any = batch.get("task") or ""
             self._loop.actor.tells = told_as(self.policy_config.env, [said] if isinstance(said, str) else said)
         return self._loop.act(frames, camera)
 
