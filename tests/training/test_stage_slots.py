@@ -51,7 +51,7 @@ def test_the_background_is_that_of_the_training_videos_and_of_no_magnified_frame
     shown = clips(32, 4)
     stage = SlotsStage(tiny_savi(), shown, SlotsStageConfig(**SETTINGS, clip_frames=4, foreground_weight=9.0))
     frames = torch.from_numpy(videos(32).frames[shown.spread(shown.train_episodes)].reshape(-1, 32, 32, 3))
-    assert stage.criterion.background is not None
-    assert torch.equal(stage.criterion.background, frames.movedim(-1, -3).float().div(255).median(0).values)
+    assert stage.criterion.backgrounds is not None
+    assert torch.equal(stage.criterion.backgrounds, frames.movedim(-1, -3).float().div(255).median(0).values[None])
     assert (stage.criterion.foreground_weight, stage.magnified.foreground_weight) == (9.0, 0.0)
-    assert SlotsStage(tiny_savi(), shown, SlotsStageConfig(**SETTINGS, clip_frames=4)).criterion.background is None
+    assert SlotsStage(tiny_savi(), shown, SlotsStageConfig(**SETTINGS, clip_frames=4)).criterion.backgrounds is None
