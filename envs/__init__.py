@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from playslot_rl import keys
 from playslot_rl.config import BlocksConfig, EnvConfig, RenderConfig
+from playslot_rl.config.env import VIDEO
 from playslot_rl.config.families import FAMILIES, OGBENCH, member, own_camera
 from playslot_rl.config.metaworld import NAME as METAWORLD
 from playslot_rl.config.metaworld import NEAR
@@ -61,7 +62,7 @@ the blocks family."""
 PROCEDURAL = ("grid_shapes",)
 """Environments that are drawn, not simulated: they give videos, there is nothing to act on and no success."""
 
-RECORDED = ("sketchy", "video")
+RECORDED = ("sketchy", VIDEO)
 """Videos that were recorded elsewhere: settings for training on them. `video` is any LeRobot data set."""
 
 

@@ -30,6 +30,11 @@ class ClosedLoop:
         self.actor, self._side, self._resize, self._seed = actor, image_size, resize, seed
         self._memory: TensorDictBase | None = None
 
+    @property
+    def begun(self) -> bool:
+        """Whether episodes run, which have been told what to do."""
+        return self._memory is not None
+
     def reset(self, seeds: Sequence[int] | None = None) -> None:
         """Begin episodes with these seeds; None forgets, and the next frames begin as many episodes as they are."""
         self._memory = None if seeds is None else self.actor.reset(seeds)

@@ -22,6 +22,7 @@ import yaml
 from playslot_rl.config import ExperimentConfig, from_dict, metaworld, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
+from playslot_rl.config.env import VIDEO
 from playslot_rl.config.families import preset_values
 from playslot_rl.config.machine import require_machine
 from playslot_rl.config.method_keys import read_alone, require_read
@@ -103,12 +104,12 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
     try:
         run = _expand_home(_unquote(pairs.get("run", "")))
         if command == "adopt":
-            pairs.setdefault("env", "video")
+            pairs.setdefault("env", VIDEO)
         continues = command in CONTINUES and run != "" and not is_pretrained(run)
         if is_pretrained(run) and run != PRETRAINED:
             pairs.setdefault("env", run.partition("/")[2])  # the task that the model is named after
             _check_choice("env", pairs["env"])
-        if run and not is_pretrained(run) and command in VIEWS and pairs.get("env") == "video":
+        if run and not is_pretrained(run) and command in VIEWS and pairs.get("env") == VIDEO:
             pairs = {**_views(Path(run)), **pairs}
         if continues:
             config, typed = _from_run(Path(run), pairs, command == "play"), _typed(pairs)
@@ -362,7 +363,7 @@ def _from_run(run: Path, pairs: Mapping[str, str], play: bool) -> ExperimentConf
 def _views(run: Path) -> dict[str, str]:
     """How a run of recorded videos read them, as it would be typed; nothing of another task."""
     stored = stored_config(run)
-    known = flatten(to_dict(stored)) if stored.env.name == "video" else {}
+    known = flatten(to_dict(stored)) if stored.env.name == VIDEO else {}
     return {key: typed_value(known[key]) for key in VIEWED if key in known}
 
 

@@ -54,10 +54,10 @@ class PolicyDriver:
     heads for the planner's, one of several tasks is told the `task` of this number.
     """
 
-    title = "latent policy"
-
-    def __init__(self, policy: LatentPolicy, planner: PlannerDriver, task: int | None = None) -> None:
-        self.policy, self.planner, self.task = policy, planner, task
+    def __init__(
+        self, policy: LatentPolicy, planner: PlannerDriver, task: int | None = None, title: str = "latent policy"
+    ) -> None:
+        self.policy, self.planner, self.task, self.title = policy, planner, task, title
 
     @torch.no_grad()
     def choose(self, session: PlaySession) -> Tensor:
@@ -73,11 +73,10 @@ def policy_drivers(agent: Agent, planner: PlannerDriver) -> dict[str, Driver]:
     """The latent policy, by name; of several tasks one for each."""
     if not agent.policy.tasks:
         return {"policy": PolicyDriver(agent.policy, planner)}
-    drivers: dict[str, Driver] = {}
-    for number, task in enumerate(agent.world_model.env.tasks):
-        drivers[f"policy: {task}"] = driver = PolicyDriver(agent.policy, planner, number)
-        driver.title = f"latent policy: {task}"
-    return drivers
+    return {
+        f"policy: {task}": PolicyDriver(agent.policy, planner, number, f"latent policy: {task}")
+        for number, task in enumerate(agent.world_model.env.tasks)
+    }
 
 
 def require_prototypes(model: WorldModel) -> Tensor:

@@ -58,7 +58,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
         if frames.is_floating_point() and not bool(((frames >= 0) & (frames <= 1)).all()):
             low, high = frames.min().item(), frames.max().item()
             raise ValueError(f"{camera}: got floats in [{low:g}, {high:g}], expected [0, 1]: divide bytes by 255")
-        if self._loop.actor.tasks:
+        if self._loop.actor.tasks and not self._loop.begun:
             said: Any = batch.get("task") or ""
             self._loop.actor.tells = told_as(self.policy_config.env, [said] if isinstance(said, str) else said)
         return self._loop.act(frames, camera)
