@@ -20,6 +20,7 @@ from playslot_rl.evaluation.card_lines import ACTIONS, MEASURES, NO_LATENTS, UNT
 from playslot_rl.evaluation.probes import (
     Floats,
     Ints,
+    code_table,
     codebook_usage,
     linear_probe,
     participation_ratio,
@@ -85,7 +86,7 @@ class ParsedEpisodes:
 
 
 def usage_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], dict[str, Any]]:
-    """Codes in use, perplexity, directions; and for the page, the counts of the codes."""
+    """Codes in use, perplexity, directions; and for the page, the counts of the codes and what was done under each."""
     k, tested = model.inverse_dynamics.n_prototypes, parsed.tested
     width = model.inverse_dynamics.latent_dim
     ratio, within = None, NO_LATENTS
@@ -97,12 +98,15 @@ def usage_lines(model: WorldModel, parsed: ParsedEpisodes) -> tuple[list[Line], 
     if not k:
         why = f"mode {model.config.inverse_dynamics.mode} has no prototypes"
         return [line("codes_in_use", None, why), line("perplexity", None, why), directions], {}
-    usage = codebook_usage(parsed.codes[tested], k)
+    usage, done = codebook_usage(parsed.codes[tested], k), []
+    if parsed.actions is not None and parsed.codes.shape[1] == 1:
+        known = tested & np.isfinite(parsed.actions).all(axis=1)
+        done = code_table(parsed.codes[known, 0], parsed.actions[known], k)
     return [
         line("codes_in_use", usage["used"] / k, f"{usage['used']} of {k}"),
         line("perplexity", usage["perplexity"] / k, f"{usage['perplexity']:.1f} of {k}"),
         directions,
-    ], {"code_counts": usage["counts"]}
+    ], {"code_counts": usage["counts"], "code_actions": done}
 
 
 def action_lines(model: WorldModel, parsed: ParsedEpisodes, seed: int) -> tuple[list[Line], dict[str, Any]]:

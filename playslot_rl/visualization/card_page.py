@@ -57,7 +57,7 @@ def told_text(result: Mapping[str, Any]) -> str:
 def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> Document:
     """The page of `inspect`: of the card and its stored `result` (`card_json`)."""
     pictures = _pictures(card, model)
-    sections = [Section(group, [table, *pictures.get(group, [])]) for group, table in card_tables(result["lines"])]
+    sections = [Section(group, blocks + pictures.get(group, [])) for group, blocks in _groups(result)]
     lead = (
         f"World model of `{result['run']}`: {verdict_text(result)}. {told_text(result)} A verdict is a rule "
         "of thumb; the borders are in the columns `good` and `bad`, what lies between is fair."
@@ -65,17 +65,22 @@ def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> D
     return Document("PlaySlot report card", lead, sections)
 
 
+def _groups(result: Mapping[str, Any]) -> list[tuple[str, list[Block]]]:
+    """Each group of lines with its table, and what a stored card has beside them."""
+    details = result["details"]
+    beside = {
+        LATENTS: [*_usage(details.get("code_counts", [])), *_code_table(details.get("code_actions", []))],
+        ACTIONS: [*_probe_table(details.get("probes", {})), *_slot_table(details.get("telling_slots", []))],
+        EFFECTS: _prototype_table(details.get("prototypes", [])),
+    }
+    return [(group, [table, *beside.get(group, [])]) for group, table in card_tables(result["lines"])]
+
+
 def _pictures(card: Card, model: WorldModel) -> dict[str, list[Block]]:
     """Pictures by the group that they belong to."""
-    found: dict[str, list[Block]] = {LATENTS: [], ACTIONS: _slot_table(card), EFFECTS: [], SLOTS: []}
-    counts = card.details.get("code_counts")
-    if counts:
-        alt = f"Share of transitions by code: {', '.join(map(str, counts))}."
-        caption = "Codes of the held-out episodes."
-        found[LATENTS].append(chart("codebook", lambda theme: usage_chart({"held out": counts}, theme), alt, caption))
+    found: dict[str, list[Block]] = {EFFECTS: [], SLOTS: []}
     if model.inverse_dynamics.latent_dim:
         found[EFFECTS] += _replay_pictures(card.replayed)
-        found[EFFECTS] += _prototype_table(card.details.get("prototypes", []))
     source, first = card.parsed.source, int(np.flatnonzero(card.parsed.tested_episodes)[0])
     clip = np.asarray(source.frames[source.episode_rows(first)])
     alt = "Rows: frames, their reconstructions, the segmentation by slot, and the part of the frame each slot holds."
@@ -146,11 +151,35 @@ def _prototype_table(table: Sequence[Mapping[str, Any]]) -> list[Block]:
     return [Table(headers, rows, caption)] if rows else []
 
 
-def _slot_table(card: Card) -> list[Block]:
+def _usage(counts: Sequence[int]) -> list[Block]:
+    alt, caption = f"Share of transitions by code: {', '.join(map(str, counts))}.", "Codes of the held-out episodes."
+    return [chart("codebook", lambda theme: usage_chart(counts, theme), alt, caption)] if counts else []
+
+
+def _code_table(table: Sequence[Mapping[str, Any]]) -> list[Block]:
+    chosen = [one for one in table if one["mean"] is not None]
     rows = [
-        [f"slot {one['slot']}", f"{one['change']:.0%}", f"{one['r2'] + 0.0:.2f}"]
-        for one in card.details.get("telling_slots", [])
+        [f"code {one['code']}", str(one["count"])]
+        + [f"{m:+.2f} ± {s:.2f}" for m, s in zip(one["mean"], one["std"], strict=True)]
+        for one in chosen
     ]
+    headers = ["prototype", "transitions", *(f"action {n + 1}" for n in range(len(rows[0]) - 2 if rows else 0))]
+    caption = "Real actions by prototype, scaled as they are learned: mean ± standard deviation."
+    return [Table(headers, rows, caption)] if rows else []
+
+
+def _probe_table(probes: Mapping[str, Any]) -> list[Block]:
+    if "latent" not in probes:
+        return []
+    kinds = {"linear": "linear", "mlp": "two-layer network"}
+    r2 = {said: probes["latent"][kind]["r2"] for kind, said in kinds.items()}
+    rows = [[said, *("–" if v is None else f"{round(v, 2) + 0.0:.2f}" for v in values)] for said, values in r2.items()]
+    headers = ["probe", *(f"action {n + 1}" for n in range(len(rows[0]) - 1))]
+    return [Table(headers, rows, "R² of each number of the action; – where it hardly varies.")]
+
+
+def _slot_table(slots: Sequence[Mapping[str, Any]]) -> list[Block]:
+    rows = [[f"slot {one['slot']}", f"{one['change']:.0%}", f"{one['r2'] + 0.0:.2f}"] for one in slots]
     caption = "How much of the slots' change is each one's, and what that alone tells of the action."
     return [Table(["slot", "share of the change", "R² of the action"], rows, caption)] if rows else []
 
@@ -171,6 +200,7 @@ def card_section(given: ReportInput) -> Section:
     if result["fingerprints"] != prints:
         return Section(title, [Missing("The report card is that of another world model.", command)])
     blocks: list[Block] = [Text(f"{verdict_text(result)}. {told_text(result)}")]
-    for group, table in card_tables(result["lines"]):
-        blocks.append(Table([group, *table.headers[1:]], table.rows))
+    for group, (table, *beside) in _groups(result):
+        assert isinstance(table, Table)
+        blocks += [Table([group, *table.headers[1:]], table.rows), *beside]
     return Section(title, [*blocks, Text("With pictures: `inspect/inspect.html`.")])

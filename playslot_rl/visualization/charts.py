@@ -241,21 +241,14 @@ def loss_names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return ["loss"] if "loss" in names and len(terms) == 1 else [n for n in names if n == "loss"] + terms
 
 
-def usage_chart(counts: Mapping[str, Sequence[int]], theme: Theme) -> bytes:
-    """PNG of the share of transitions for each code, of K counts for each data set."""
+def usage_chart(counts: Sequence[int], theme: Theme) -> bytes:
+    """PNG of the share of transitions for each code, of K counts."""
     figure = new_figure(6.4, 2.4)
     axes = figure.add_subplot()
-    k = max(len(c) for c in counts.values())
-    width = 0.8 / len(counts)
-    for i, (name, values) in enumerate(counts.items()):
-        share = 100 * np.array(values) / max(1, sum(values))
-        x = np.arange(len(values)) + (i - (len(counts) - 1) / 2) * width
-        axes.bar(x, share, width * 0.92, color=theme.series[i % len(theme.series)], label=name)
-    axes.set_xticks(range(k))
+    axes.bar(np.arange(len(counts)), 100 * np.array(counts) / max(1, sum(counts)), 0.74, color=theme.series[0])
+    axes.set_xticks(range(len(counts)))
     axes.set_xlabel("code")
     axes.set_ylabel("transitions, %")
     style_axes(axes, theme)
     axes.grid(False, axis="x")
-    if len(counts) > 1:
-        legend(figure, theme, ncols=4, fontsize=9)
     return figure_bytes(figure, theme)

@@ -26,7 +26,6 @@ from playslot_rl.visualization import sections as part
 from playslot_rl.visualization.card_page import card_section
 from playslot_rl.visualization.document import Block, Document, Missing, Picture, Section, Table, Text, write_document
 from playslot_rl.visualization.grid import film_strip
-from playslot_rl.visualization.latents import latent_section
 from playslot_rl.visualization.sections import ReportInput, percent, seconds
 from playslot_rl.world_model import Agent, WorldModel
 
@@ -81,7 +80,6 @@ def build(given: ReportInput) -> Document:
         part.rollout_section(given),
         part.slots_section(given, clip),
         part.prototype_section(given, clip),
-        latent_section(given),
         card_section(given),
         part.training_section(given),
         settings_section(given),

@@ -14,9 +14,9 @@ import torch
 
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import ExperimentConfig, to_dict
-from playslot_rl.errors import ConfigError, DataError
+from playslot_rl.errors import ConfigError
+from playslot_rl.evaluation.card_lines import line
 from playslot_rl.testing import tiny_config
-from playslot_rl.visualization import latents
 from playslot_rl.visualization.charts import loss_names
 from playslot_rl.visualization.document import Document, Missing, Section, Table, Text, to_html, to_markdown
 from playslot_rl.visualization.report import notes, read_metas, settings_section, write_report
@@ -89,6 +89,33 @@ def _run(folder: Path, config: ExperimentConfig) -> Path:
     return run
 
 
+def _card(run: Path) -> None:
+    """A stored card, of a code that was chosen and one that was not."""
+    details = {
+        "code_counts": [3, 0],
+        "code_actions": [
+            {"code": 2, "count": 3, "mean": [0.5], "std": [0.1]},
+            {"code": 1, "count": 0, "mean": None, "std": None},
+        ],
+        "probes": {"latent": {"linear": {"r2": [0.3, None]}, "mlp": {"r2": [0.4, None]}}},
+        "telling_slots": [{"slot": 1, "change": 0.8, "r2": 0.7}],
+        "prototypes": [{"code": 2, "slot": 3, "pixels": [3.0, -1.0], "spread": 0.5}],
+    }
+    metas = read_metas(run)
+    card = {
+        "lines": [line("perplexity", 0.5).plain(), line("linear_probe", 0.3).plain(), line("replay", 0.9).plain()],
+        "details": details,
+        "fingerprints": {stage: metas.get(stage, {}).get("fingerprint") for stage in ("slots", "dynamics")},
+        "episodes_tested": [3],
+        "held_out_known": True,
+        "held_out": "held out",
+        "data": "videos",
+        "episodes_fitted": 3,
+    }
+    (run / "inspect").mkdir()
+    (run / "inspect" / "inspect.json").write_text(json.dumps(card))
+
+
 def _agent(config: ExperimentConfig) -> Agent:
     torch.manual_seed(0)
     agent = Agent.untrained(WorldModel(config.model, config.env)).train()
@@ -99,32 +126,20 @@ def _agent(config: ExperimentConfig) -> Agent:
 @pytest.mark.integration
 def test_report_of_a_whole_run_is_self_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = tiny_config(max_steps=2)
-    rng = np.random.default_rng(0)
-    z, actions = rng.normal(size=(40, 8)).astype(np.float32), rng.normal(size=(40, 4)).astype(np.float32)
-    codes, episodes = rng.integers(0, 5, (40, 1)), np.repeat(np.arange(4), 10)
-    probe = latents.probe_actions(z, actions, episodes, codes=codes)
-    folders = [tmp_path / "expert", tmp_path / "broken"]
-    for folder in folders:
-        (folder / "meta").mkdir(parents=True)
-        (folder / "meta" / "info.json").touch()
-    monkeypatch.setattr(latents, "data_folders", lambda *_: folders)
-
-    def read(model: WorldModel, root: Path, given: object, name: str) -> latents.LatentData:
-        if root.name == "broken":
-            raise DataError("broken: no such thing")
-        return latents.LatentData(name, codes, actions, probe)
-
-    monkeypatch.setattr(latents, "read_latents", read)
     run = _run(tmp_path, config)
+    _card(run)
     path = write_report(run, agent=_agent(config))
     html, text = path.read_text(), (run / "report.md").read_text()
     _check_page(html)
-    for title in ("Success", "rollouts", "Slots", "Action prototypes", "Latent actions", "Training", "Settings"):
+    for title in ("Success", "rollouts", "Slots", "Action prototypes", "Report card", "Training", "Settings"):
         assert re.search(f"<h2>.*{title}", html), title
     assert "98 %" in html
     assert "9 demonstration videos, the real actions of 4 of them" in text
     assert "Still stretches left out: 41 % of the demonstrations' rows were learned from" in text
-    assert "broken: no such thing" in text
+    assert "| code 2 | 3 | +0.50 ± 0.10 |" in text
+    assert "| linear | 0.30 | – |" in text
+    assert "| slot 1 | 80% | 0.70 |" in text
+    assert "| code 2 | slot 4 | +3.0 right, -1.0 down | 0.5 |" in text
     assert "Stage dynamics is not finished" in text
     named = re.findall(r"\]\((figures/[a-z_]+\.png)\)", text)
     assert len(named) == 7
@@ -207,22 +222,6 @@ def test_a_mode_without_prototypes_is_said_so(tmp_path: Path) -> None:
     model = WorldModel(config.model, config.env)
     write_report(tmp_path, config, world_model=model)
     assert "mode is `continuous`, which has no prototypes" in (tmp_path / "report.md").read_text()
-
-
-def test_sets_of_one_name_are_told_apart_and_any_number_has_a_chart(tmp_path: Path) -> None:
-    from playslot_rl.visualization.charts import LIGHT, usage_chart
-
-    folders = [tmp_path / name for name in ("a/train", "b/train", "c")]
-    assert latents.told_apart(folders) == ["a/train", "b/train", f"{tmp_path.name}/c"]
-    assert latents.told_apart(folders[1:]) == ["train", "c"]
-    sets = [latents.LatentData(str(n), np.zeros((6, 1), np.int64), None, None, whole=n > 0) for n in range(9)]
-    table, picture = latents._usage(sets, 4)
-    assert isinstance(table, Table)
-    assert len(table.rows) == 9
-    assert table.caption == "The first 200 episodes of each data set."
-    assert latents._usage(sets[1:], 4)[0].caption == ""  # type: ignore[union-attr]
-    assert usage_chart({str(n): [1, 2] for n in range(30)}, LIGHT)
-    assert picture is not None
 
 
 def test_scores_of_other_weights_and_of_other_episodes_are_not_passed_off(tmp_path: Path) -> None:
