@@ -81,10 +81,15 @@ class SeededView(TensorView):
 
     def view(self, observation: dict[str, npt.NDArray[Any]], info: dict[str, Any]) -> View:
         """One observation, the expert's action for it (zeros where none is asked), and which episode it belongs to."""
-        task, space = task_env(self.env), self.action_space
+        space = self.action_space
+        shown = task_env(self.env).expert_action() if self.asks else np.zeros(space.shape or (), space.dtype)
+        if np.shape(shown) != space.shape or not np.isfinite(shown).all():
+            raise ConfigError(
+                f"env: got {shown!r} from the task's expert_action, expected {space.shape} finite numbers in [-1, 1]"
+            )
         return {
             **super().view(observation, info),
-            keys.EXPERT_ACTION: task.expert_action() if self.asks else np.zeros(space.shape or (), space.dtype),
+            keys.EXPERT_ACTION: shown,
             EPISODE_INDEX: np.array([self._running[0] if self._running else 0], np.int64),
             EPISODE_SEED: np.array([self._episode_seed], np.int64),
             EPISODE_STEP: np.array([self._step], np.int64),

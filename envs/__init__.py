@@ -248,6 +248,7 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
     if env.name == GYM.name:
         from playslot_rl.envs import gym_task
 
+        gym_task.warn_of_success(env)
         if expert:
             gym_task.check_expert(env)
         if success:
@@ -260,8 +261,13 @@ def _in_mujoco(env: EnvConfig) -> bool:
 
 
 def _check_variation(env: EnvConfig) -> None:
+    got, task = f"env.variation: got {', '.join(env.variation.words)}", " ".join(env.typed)
     if env.variation.on and not _in_mujoco(env):
-        raise ConfigError(f"env.variation: got {env.variation}, expected none: env={env.full_name} draws itself")
+        raise ConfigError(f"{got}, expected none: {task} draws itself")
+    if env.name == GYM.name and (env.variation.textures or env.variation.colours):
+        raise ConfigError(
+            f"{got}, expected no textures and colours with {task}, whose parts nobody names: leave them out"
+        )
 
 
 def has_parts(env: EnvConfig) -> bool:

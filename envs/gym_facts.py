@@ -33,13 +33,14 @@ SQUASHED: Final = 4 / 3
 @dataclass(frozen=True)
 class Facts:
     """What an environment says of itself: widths of action and observation, the entry of info that says success (empty
-    where there is none), environment steps a second and in an episode (0: no limit), and whether MuJoCo knows its
-    parts.
+    where there is none), all entries that info had, environment steps a second and in an episode (0: no limit), and
+    whether MuJoCo knows its parts.
     """
 
     actions: int
     state: int
     success: str
+    entries: tuple[str, ...]
     hz: float
     steps: int
     parts: bool
@@ -89,11 +90,16 @@ def open_env(name: str) -> gym.Env[Any, Any]:
                 name, max_episode_steps=-1, render_mode="rgb_array", disable_env_checker=True
             )
         except gym.error.UnregisteredEnv as error:
-            near = ", ".join(difflib.get_close_matches(name, [*gym.registry], n=3, cutoff=0.0))
+            module, colon, own = name.rpartition(":")
+            near = ", ".join(
+                module + colon + one for one in difflib.get_close_matches(own, _current(), n=3, cutoff=0.0)
+            )
             raise ConfigError(f"env.id: got {name!r}, expected a registered id; the nearest are {near}") from error
     space, modes, said = env.action_space, env.metadata.get("render_modes") or (), ""
     if not isinstance(space, gym.spaces.Box) or space.dtype.kind != "f":
         said = f"got actions {space}, expected a Box of real numbers"
+    elif not np.prod(space.shape):
+        said = f"got actions {space}, expected one number or more"
     elif not space.is_bounded("both"):
         said = f"got actions {space}, expected bounds below and above"
     elif "rgb_array" not in modes:
@@ -102,6 +108,12 @@ def open_env(name: str) -> gym.Env[Any, Any]:
         env.close()
         raise ConfigError(f"env.id={name}: {said}; choose another environment, or wrap it under an id of your own")
     return env
+
+
+def _current() -> list[str]:
+    """The registered ids, without earlier versions of others, which often need what is gone."""
+    by_version = sorted(gym.registry.values(), key=lambda spec: spec.version or 0)
+    return [*{(spec.namespace, spec.name): spec.id for spec in by_version}.values()]
 
 
 def flat(observation: Any) -> npt.NDArray[np.float32]:
@@ -127,26 +139,29 @@ def facts(name: str) -> Facts:
     with first_steps(name):
         try:
             observation, _ = env.reset(seed=0)
-            success, parts = _said(env), is_mujoco(env)
+            (success, entries), parts = _said(env), is_mujoco(env)
             if not parts:
                 _warn(name, *picture(env, name).shape[:2])
         finally:
             env.close()
     steps = gym.spec(env.spec.id).max_episode_steps if env.spec else None
     hz, actions = float(env.metadata.get("render_fps") or 10), int(np.prod(env.action_space.shape or ()))
-    return Facts(actions, len(flat(observation)), success, hz, steps or 0, parts)
+    return Facts(actions, len(flat(observation)), success, entries, hz, steps or 0, parts)
 
 
-def _said(env: gym.Env[Any, Any]) -> str:
-    """The first of `SUCCESS` that info holds in one of an episode's steps: some say it in the last alone."""
+def _said(env: gym.Env[Any, Any]) -> tuple[str, tuple[str, ...]]:
+    """The first of `SUCCESS` that info holds in one of an episode's steps (some say it in the last alone), and all that
+    it held until then.
+    """
     box: Any = env.action_space
-    middle = ((box.low + box.high) / 2).astype(box.dtype)
+    middle, entries = ((box.low + box.high) / 2).astype(box.dtype), dict[str, None]()
     for _ in range(PROBED):
         *_, ended, cut, info = env.step(middle)
+        entries |= dict.fromkeys(map(str, info))
         found = next((key for key in SUCCESS if key in info), "")
         if found or ended or cut:
-            return found
-    return ""
+            return found, tuple(entries)
+    return "", tuple(entries)
 
 
 def is_mujoco(env: gym.Env[Any, Any]) -> bool:

@@ -6,6 +6,7 @@ Shapes: A = numbers of the Box, S = numbers of the environment's own observation
 from __future__ import annotations
 
 import importlib
+import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
@@ -31,7 +32,7 @@ SEED_BITS: Final = 32
 """Of the seeds that any environment takes: numpy's older generator refuses longer ones."""
 NO_EXPERT: Final = (
     "env.expert: got nothing with env.id={}, expected package.module:function "
-    "(observation, info, generator -> action), or policy=random"
+    "(observation, info, generator -> action); `collect` records without one (policy=random)"
 )
 
 
@@ -87,6 +88,19 @@ def check_expert(env: EnvConfig) -> None:
         task.expert_action()
     finally:
         task.inner.close()
+
+
+def warn_of_success(env: EnvConfig) -> None:
+    """Warn where no step of a trial had `env.success` in its info: an entry that comes late, or is misspelt."""
+    entries = facts(env.id).entries
+    if env.success and env.success not in entries:
+        warnings.warn(
+            f"env.success={env.success}: got no such entry in the info of a trial of {env.id}, expected one of "
+            f"{', '.join(entries) or 'those that it has'}, or one that comes later: nothing is a success where it "
+            "is missing",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def require_success(env: EnvConfig) -> None:

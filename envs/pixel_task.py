@@ -44,7 +44,8 @@ def check_actions(env: EnvConfig, actions: int = ACTION_DIM) -> None:
     """Refuse an `env.action_dim` other than the task's by a ConfigError."""
     if env.action_dim != actions:
         raise ConfigError(
-            f"env.action_dim: got {env.action_dim}, expected {actions} for {env.name}: leave env.action_dim out"
+            f"env.action_dim: got {env.action_dim}, expected {actions} for {env.name}: leave env.action_dim out, or "
+            "give a task of your own `actions_of`"
         )
 
 
@@ -233,13 +234,23 @@ class PixelTask(gym.Env[Observation, Action]):
             raise ValueError(f"action: got {action!r}, expected {self.config.action_dim} finite numbers in [-1, 1]")
         reward, success = self._simulate(np.clip(action, -1.0, 1.0))
         self._steps += 1
+        if not np.isfinite(reward):
+            raise self._not_finite("a reward")
         return self._observe(self.draw_steps), reward, False, self._steps >= self.config.max_steps, {"success": success}
 
     def _observe(self, draw: bool) -> Observation:
         if draw or self._frame is None:
             self._frame = self._fitting(keys.PIXELS, self.draw())
         state = np.asarray(self._state(), np.float32)
+        if not np.isfinite(state).all():
+            raise self._not_finite(keys.STATE)
         return Observation({keys.PIXELS: self._frame, keys.STATE: self._fitting(keys.STATE, state)})
+
+    def _not_finite(self, what: str) -> ConfigError:
+        return ConfigError(
+            f"{' '.join(self.config.typed)}: got {what} that is NaN or infinite in agent step {self._steps} of episode "
+            f"{self.episode}, expected finite numbers: mend the task, or choose another"
+        )
 
     def _fitting(self, key: str, part: Any) -> Any:
         """A part of an observation; a ConfigError where it is of another kind or shape than its space."""

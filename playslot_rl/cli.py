@@ -16,6 +16,7 @@ import sys
 import textwrap
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NoReturn
@@ -137,9 +138,20 @@ def _alone(name: str) -> int:
     )
 
 
+def _noted(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    """A warning of what was typed as a note, others as Python shows them."""
+    if category is RuntimeWarning and str(message).startswith("env."):
+        return f"note: {message}\n"
+    return _plainly(message, category, filename, lineno, line)
+
+
+_plainly: Final = warnings.formatwarning
+
+
 def _run(name: str, options: argparse.Namespace) -> int:
     from playslot_rl.config.compose import compose_each
 
+    warnings.formatwarning = _noted
     try:
         configs = compose_each(options.overrides, name)
     except ConfigError as error:

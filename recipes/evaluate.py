@@ -77,7 +77,10 @@ def _require_policy(config: ExperimentConfig, run: Run) -> None:
     from playslot_rl.evaluation.success import run_facts
 
     run_facts(run.folder, config.method)
-    require_task(config, run.own(method_stage(config.method)).group(EnvConfig, "env"))
+    trained = run.own(method_stage(config.method)).group(EnvConfig, "env")
+    require_task(config, trained)
+    if config.env.seen != trained.seen:
+        print(f"note: evaluated with {config.env.seen}; run={config.run} was trained with {trained.seen}", flush=True)
 
 
 def error_of_actions(config: ExperimentConfig, run: Run) -> None:

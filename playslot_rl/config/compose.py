@@ -23,7 +23,7 @@ from playslot_rl.config import ExperimentConfig, from_dict, metaworld, plugins, 
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.env import VIDEO
-from playslot_rl.config.families import preset_values
+from playslot_rl.config.families import GYM, preset_values
 from playslot_rl.config.machine import require_machine
 from playslot_rl.config.method_keys import read_alone, require_read
 from playslot_rl.config.methods import canonical_method
@@ -115,6 +115,8 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             config, typed = _from_run(Path(run), pairs, command == "play"), _typed(pairs)
         else:
             values, typed = _presets(pairs.get("env", PLAIN_ENV), pairs.get("preset", PRESET)), _typed(pairs)
+            if command == "collect" and (steps := typed.get("env", {}).get("max_steps")):  # it has no other use there
+                typed = merged({"collect": {"random_steps": steps, "expert_steps": steps}}, typed)
             config = from_dict(ExperimentConfig, _with_task(values, typed))
             if config.env.id and not {"env.action_dim", "env.max_steps"} <= pairs.keys():  # only the environment knows
                 config = from_dict(ExperimentConfig, _with_task(values, typed, plugins.call(FITTED, config.env)))
@@ -132,18 +134,21 @@ def compose_each(overrides: Sequence[str], command: str = "") -> list[Experiment
     """The config of a command, or with `envs=metaworld/drawer-open,block_push_easy` one for each task; a ConfigError as
     of `compose`, and for keys that are of one task.
     """
-    pairs = dict(argument.partition("=")[::2] for argument in _short_keys(overrides, command))
+    typed = _short_keys(overrides, command)
+    pairs = dict(argument.partition("=")[::2] for argument in typed)
     names = pairs.get("compare.envs", "").strip().removeprefix("[").removesuffix("]")
     if command != "compare" or not names.strip():
         return [compose(overrides, command)]
     for key in ("env", "env.task", "env.id", "data.root", "data.demos"):
         if key in pairs:
             raise ConfigError(f"{key}: got {pairs[key]} with envs=, expected none: it is of one task")
-    found = []
-    for task in names.split(","):
-        env, slash, own = _unquote(task.strip()).partition("/")
-        chosen = [f"{'env.id' if env == 'gym' else 'env.task'}={own}"] if slash else []
-        found.append(compose([*overrides, f"env={env}", *chosen], command))
+    tasks = [_unquote(task.strip()).partition("/") for task in names.split(",")]
+    gym, found = any(env == GYM for env, _, _ in tasks), []
+    for env, slash, own in tasks:
+        chosen = [f"{'env.id' if env == GYM else 'env.task'}={own}"] if slash else []
+        others = ("env.expert", "env.success") if gym and env != GYM else ()  # of Gymnasium's environments alone
+        keys = [argument for argument in typed if argument.partition("=")[0] not in others]
+        found.append(compose([*keys, f"env={env}", *chosen], command))
     return found
 
 

@@ -248,6 +248,11 @@ class EnvConfig(Checked):
         seen = [] if self.camera == own_camera(self.name, self.task) else [f"env.camera={self.camera}"]
         return [f"env={self.name}", *own, *seen]
 
+    @property
+    def seen(self) -> str:
+        """How it is looked at: the camera, and what varies."""
+        return ", ".join([f"env.camera={self.camera}", *self.variation.words])
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for key in ("id", "expert", "success"):
@@ -256,7 +261,12 @@ class EnvConfig(Checked):
         seen = self.name in ("gym", metaworld.NAME) or not self.camera
         check(seen, "env.camera", self.camera, f"none with env={self.name}: it is of env=gym and env={metaworld.NAME}")
         drawn = self.name not in ("grid_shapes", "sketchy", VIDEO) or not self.variation.on
-        check(drawn, "env.variation", self.variation, f"nothing with env={self.name}, which no simulator draws")
+        check(
+            drawn,
+            "env.variation",
+            ", ".join(self.variation.words),
+            f"nothing with env={self.name}, which no simulator draws",
+        )
         if self.name in FAMILIES:
             object.__setattr__(self, "task", task_name(self.name, self.task))
             alone, small = metaworld.seen_by(self.task, self.camera), ", ".join(metaworld.SMALL)

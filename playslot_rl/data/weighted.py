@@ -17,8 +17,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.config import EnvConfig, ExperimentConfig, metaworld
+from playslot_rl.config import EnvConfig, ExperimentConfig, from_dict, metaworld
+from playslot_rl.config.env import VariationConfig
 from playslot_rl.config.weights import DataRoot, data_roots
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.metadata import read_record
 from playslot_rl.data.source import EpisodeFrames, open_sources
@@ -93,17 +95,28 @@ def draw_episodes(
     return order[position].astype(np.int64), offset.astype(np.int64)
 
 
-def _require_view(env: EnvConfig, root: str) -> None:
-    """Refuse frames of the task that our collectors recorded by another camera than `env.camera`, by a DataError."""
+def _require_view(env: EnvConfig, root: str, demos: bool) -> None:
+    """Refuse frames of the task that our collectors recorded by another camera than `env.camera`, and demonstrations of
+    another of Gymnasium's environments, by a DataError; say where these vary otherwise (`env.variation`).
+    """
     record = read_record(Path(root).expanduser()) or {}
-    for entry in (record, *(record.get("sources") or ())):
-        seen = (entry.get("spec") or {}).get("env") or {}
-        got, expected = seen.get("camera", ""), metaworld.seen_by(str(seen.get("task", "")), env.camera)
-        if seen.get("name") == env.name and got != expected:
+    recorded = [(entry.get("spec") or {}).get("env") or {} for entry in (record, *(record.get("sources") or ()))]
+    for seen in (seen for seen in recorded if seen.get("name") == env.name):
+        if demos and seen.get("id", "") != env.id:
+            raise DataError(f"{root}: got demonstrations of env.id={seen.get('id')}, expected those of env.id={env.id}")
+        task = str(seen.get("task", ""))
+        if demos and task and not {*metaworld.names(task)} & {*metaworld.names(env.task)}:
+            continue  # refused by what is done in them (`playslot_rl.data.tasks`)
+        got, expected = seen.get("camera", ""), metaworld.seen_by(task, env.camera)
+        if got != expected:
             raise DataError(
                 f"{root}: got frames recorded with env.camera={got}, expected env.camera={expected}: record them anew, "
                 f"or set env.camera={got} here and wherever the model acts"
             )
+        varied = from_dict(VariationConfig, seen.get("variation") or {})
+        if demos and varied != env.variation:
+            words = [" ".join(one.words) or "nothing" for one in (varied, env.variation)]
+            say_once(f"note: {root}: env.variation was {words[0]} in these demonstrations, and is {words[1]} here")
 
 
 def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:
@@ -120,9 +133,9 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         parts = [open_configured(config, [root.path]) for root in named]
         return weighted(parts, [root.weight for root in named])
     data, size = config.data, config.env.image_size
-    paths = [root.path for root in named]
+    paths, demos = [root.path for root in named], {root.path for root in data_roots(data.demos)}
     for path in paths:
-        _require_view(config.env, path)
+        _require_view(config.env, path, path in demos)
     buffer = data.shuffle_buffer if data.stream else None
     source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
     return every(source, data.stride, data.stride_action)

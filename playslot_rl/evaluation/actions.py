@@ -29,6 +29,8 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, cloning_methods
+from playslot_rl.data.action_limits import said, scaled
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.demonstrations import split_demonstrations, transitions
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.tasks import told_tasks
@@ -260,6 +262,19 @@ def measure_actions(
     }
 
 
+def _say_elsewhere(source: EpisodeFrames, taught: dict[str, Any] | None) -> None:
+    """Say which numbers of the actions never are between the taught ends (`ActionLimits.plain`): of another unit."""
+    if not taught or not scaled(taught):
+        return
+    low, high = np.asarray(taught["low"]), np.asarray(taught["high"])
+    actions = source.require_actions(len(low))
+    least, most = np.nanmin(actions, 0), np.nanmax(actions, 0)
+    if len(far := np.flatnonzero((low < high) & ((least > high) | (most < low)))):
+        met = ", ".join(f"{taught['names'][i]} {least[i]:.6g}..{most[i]:.6g}" for i in far)
+        known = said({key: [taught[key][i] for i in far] for key in ("names", "low", "high")})
+        say_once(f"note: {source.name}: got {met}, where the policy was taught {known}: are the units the same?")
+
+
 def policy_stages(run: Run, method: str) -> dict[str, StageCheckpoint]:
     """The stage of a method's policy, first, and all that it builds on."""
     last = run.stage(METHODS[method].last.name)
@@ -291,6 +306,7 @@ def evaluate_actions(run: Run, config: ExperimentConfig, device: torch.device) -
             "actions: train it again"
         )
     recorded = Recorded.of(config, run, stages)
+    _say_elsewhere(recorded.source, taught.get("actions"))
     began, actor = time.perf_counter(), plugins.call(METHODS[config.method].load.actor, run, device)
     actor.eval()
     source = recorded.source

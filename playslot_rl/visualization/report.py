@@ -12,7 +12,7 @@ import numpy as np
 
 from playslot_rl.acting.actor import ExpertActor
 from playslot_rl.acting.episodes import TaskPool, record
-from playslot_rl.config import ExperimentConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig, from_dict
 from playslot_rl.envs import PROCEDURAL
 from playslot_rl.envs.grid_shapes import generate
 from playslot_rl.errors import CheckpointError
@@ -113,6 +113,8 @@ def settings_section(given: ReportInput) -> Section:
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
         drawn = result.get("render", {}).get("quality", given.config.render.quality)
         how = f"at most {given.steps(result)} agent steps, rendering `{drawn}`"
+        if "env" in result and (seen := from_dict(EnvConfig, result["env"]).seen) != given.config.env.seen:
+            how += f", **seen with {seen}**"
         measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn, {how}"])
     return Section(
         "Settings and notes", [part.settings_table(model, task, measured), *(Text(note) for note in notes(given))]

@@ -143,6 +143,19 @@ def test_episodes_that_start_solved_are_redrawn(monkeypatch: pytest.MonkeyPatch)
     env.close()
 
 
+@pytest.mark.parametrize("shown", [np.zeros(3, np.float32), np.full(4, np.nan, np.float32)])
+def test_an_experts_action_that_is_none_is_one_line(monkeypatch: pytest.MonkeyPatch, shown: Any) -> None:
+    from playslot_rl.collectors.episodes import SeededView
+    from playslot_rl.envs import make_env
+
+    spec = spec_of(1)
+    env = make_env(spec.env, spec.render)
+    monkeypatch.setattr(type(env.unwrapped), "expert_action", lambda _: shown)
+    with pytest.raises(ConfigError, match=r"from the task's expert_action, expected \(4,\) finite numbers"):
+        SeededView(env, [(0, 0)]).reset()
+    env.close()
+
+
 def test_any_seed_is_taken_and_its_data_are_whole(tmp_path: Path) -> None:
     from playslot_rl.evaluation.held_out import recorded_seeds
 

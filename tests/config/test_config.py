@@ -423,3 +423,11 @@ def test_a_group_checks_its_ranges_under_its_own_name() -> None:
 def test_a_value_outside_its_range_is_refused_by_its_full_name(argument: str, message: str) -> None:
     with pytest.raises(ConfigError, match=f"^{message}"):
         compose([argument])
+
+
+def test_collect_records_episodes_as_long_as_is_typed() -> None:
+    """Elsewhere `env.max_steps` is of evaluation."""
+    for env in ("env=metaworld", "env=ogbench", "env=button_press"):
+        steps = compose([env, "env.max_steps=7", "collect.random_steps=9"], "collect").collect
+        assert (steps.random_steps, steps.expert_steps) == (9, 7)
+        assert compose([env, "env.max_steps=7"], "pipeline").collect.expert_steps > 7

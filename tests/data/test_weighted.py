@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from playslot_rl.config import DataConfig, EnvConfig
+from playslot_rl.config.env import VariationConfig
 from playslot_rl.data.action_limits import ActionLimits
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
@@ -201,6 +202,26 @@ def test_frames_of_another_view_of_the_task_are_refused(
     config = replace(config, env=EnvConfig("metaworld", image_size=32, **asked))  # type: ignore[arg-type]
     with pytest.raises(DataError, match=re.escape(message)) if message else contextlib.nullcontext():
         open_configured(config, str(root))
+
+
+def test_demonstrations_of_another_gymnasium_task_are_refused_and_varied_ones_said(
+    foreign_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Videos may be of any."""
+    root = shutil.copytree(foreign_images, tmp_path / "set")
+    seen = {"name": "gym", "id": "FetchReach-v4", "variation": {"background": True}}
+    (root / "meta/playslot.json").write_text(json.dumps({"episodes": [], "spec": {"env": seen}}))
+    data = DataConfig(cache=str(tmp_path / "cache"), resize=True, demos=str(root))
+    config = replace(tiny_config(), data=data, env=EnvConfig("gym", image_size=32, id="FetchPush-v4"))
+    with pytest.raises(DataError, match=r"env\.id=FetchReach-v4, expected those of env\.id=FetchPush"):
+        open_configured(config, str(root))
+    assert open_configured(replace(config, data=replace(data, demos="")), str(root)).episodes
+    config = replace(config, env=replace(config.env, id="FetchReach-v4"))
+    open_configured(config, str(root))
+    assert "env.variation was background in these demonstrations, and is nothing here" in capsys.readouterr().err
+    same = VariationConfig(background=True)
+    open_configured(replace(config, env=replace(config.env, variation=same, frame_skip=1)), str(root))
+    assert "env.variation" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("order", [("pan", "lift"), ("lift", "pan"), ("x", "y")])

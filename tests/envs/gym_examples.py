@@ -29,9 +29,10 @@ class Line(gym.Env[Any, Any]):
         picture: Any = None,
         says: str = "",
         fails: str = "",
+        lost: str = "",
     ) -> None:
         self.render_mode, self.picture, self.taken = render_mode, picture, np.zeros(0)
-        self.says, self.fails = says, fails
+        self.says, self.fails, self.lost = says, fails, lost
         self.action_space = gym.spaces.Box(-2.0, 4.0, (1,), np.float32) if space is None else space
         self.metadata = {**self.metadata, **({} if modes is None else {"render_modes": modes})}
 
@@ -45,7 +46,9 @@ class Line(gym.Env[Any, Any]):
         self.taken = np.asarray(action)
         self.place += 0.1 * float(self.taken[0])
         over = self.place > GOAL
-        return np.array([self.place]), 1.0, over, False, {self.says: True} if self.says and over else {}
+        values = {"place": self.place, "reward": 1.0} | ({self.lost: np.nan} if self.lost else {})
+        info = {self.says: True} if self.says and over else {}
+        return np.array([values["place"]]), values["reward"], over, False, info
 
     def _fail(self, where: str) -> None:
         if self.fails == where:

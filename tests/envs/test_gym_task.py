@@ -226,7 +226,11 @@ def test_a_camera_or_a_variation_that_there_is_not_is_refused_before_anything_is
     varied = VariationConfig(background=True)
     for config, said in (
         (line(camera="front"), "env.camera: got 'front', expected none"),
-        (line(variation=varied), r"env\.variation: .* draws itself"),
+        (line(variation=varied), r"env\.variation: got background, .* draws itself"),
+        (
+            line(id="FetchReach-v4", action_dim=4, variation=VariationConfig(textures=True)),
+            "env.variation: got textures, expected no textures and colours",
+        ),
         (line(id="FetchReach-v4", action_dim=4, camera="hed_camera_rgb"), "did you mean env.camera=head_camera_rgb"),
     ):
         with pytest.raises(ConfigError, match=said):
@@ -280,6 +284,33 @@ def test_success_may_be_said_in_the_last_step_alone(name: str, says: str, typed:
     task.close()
     with pytest.raises(ConfigError, match=r"name another entry \(env\.success=\)"):
         check_task(line(id=gym_examples.register("LineTold-v0", says="won")), success=True)
+
+
+def test_a_success_that_no_info_has_is_warned_of() -> None:
+    """It may come later than in a trial, or never."""
+    told = gym_examples.register("LineTold-v0", says="won")
+    with pytest.warns(RuntimeWarning, match=r"env\.success=wonn: got no such entry in .* one of won"):
+        check_task(line(id=told, success="wonn"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        facts(told)
+        check_task(line(id=told, success="won"))
+
+
+@pytest.mark.parametrize("lost", ["place", "reward"])
+def test_numbers_that_are_none_are_refused_where_they_come(lost: str) -> None:
+    task = made(line(id=gym_examples.register(f"LineLost{lost}-v0", lost=lost)))
+    task.reset(seed=3)
+    with pytest.raises(ConfigError, match=r"env.id=LineLost.*NaN or infinite in agent step 1 of episode 3"):
+        task.step(np.zeros(1, np.float32))
+    task.close()
+
+
+def test_a_misspelt_id_names_what_can_be_typed() -> None:
+    gym_examples.register("LineOld-v0")
+    gym_examples.register("LineOld-v1")
+    with pytest.raises(ConfigError, match=r"the nearest are .*gym_examples:LineOld-v1, gym_examples:"):
+        facts("gym_examples:LineOdl-v0")
 
 
 def test_each_stream_has_its_own_short_seeds() -> None:

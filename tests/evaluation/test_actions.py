@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from playslot_rl import keys
 from playslot_rl.acting.actor import ReactiveActor
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.evaluation.actions import measure_actions
+from playslot_rl.evaluation.actions import _say_elsewhere, measure_actions
 from playslot_rl.modules.action_range import ActionRange
 
 LENGTHS = (4, 3)
@@ -74,6 +74,17 @@ def test_the_constant_is_zero_and_no_error_is_one(actor: ReactiveActor) -> None:
     assert (constant["r2"], constant["ci95"]["r2"]) == (0.0, [0.0, 0.0])
     low, high = constant["ci95"]["mae"]
     assert low < constant["mae"] < high
+
+
+def test_another_unit_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    taught = {"names": ["pan", "lift", "grip"], "low": [-90.0, -110.0, 1.0], "high": [50.0, -30.0, 1.0]}
+    for lift, said in ((-1.0, True), (-50.0, False)):
+        source = recorded([[0, 0]] * 7, [[np.nan] * 3, [0, lift, 5], *[[1, lift - 1, 5]] * 5])
+        _say_elsewhere(source, taught)
+        line = "got lift -2..-1, where the policy was taught lift -110..-30: are the units the same?"
+        assert (line in capsys.readouterr().err) == said
+    _say_elsewhere(source, None)
+    assert not capsys.readouterr().err
 
 
 def test_actions_that_are_not_known_do_not_count(actor: ReactiveActor) -> None:

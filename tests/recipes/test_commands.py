@@ -74,6 +74,13 @@ def test_eval_info_has_the_promised_keys(shared_run: Path, protocol: str) -> Non
         assert reference["ci95"] == list(wilson(round(2 * reference["success_rate"]), 2))
 
 
+def test_an_evaluation_that_sees_otherwise_says_so_there_and_in_the_report(run: Path) -> None:
+    done = smoke("evaluate", f"run={run}", "episodes=1", "env.variation.light=0.5")
+    assert "note: evaluated with env.camera=, light0.5; " in done.out
+    report = (run / "report.md").read_text()
+    assert report.count("**seen with env.camera=, light0.5**") == 1, "the imagination's was not"
+
+
 @pytest.mark.parametrize(
     "command",
     [

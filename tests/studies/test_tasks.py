@@ -21,7 +21,7 @@ from playslot_rl.studies.success.jobs import SuccessJob, success_jobs
 from playslot_rl.studies.success.measure import SuccessMeasure, check_success, job_rows
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.summary import summarise
-from playslot_rl.studies.success.task_table import joint_table
+from playslot_rl.studies.success.task_table import joint_table, tasks_page
 from playslot_rl.visualization.document import to_markdown
 
 TWO = "envs=metaworld/door-open,block_push_easy"
@@ -46,6 +46,14 @@ def test_each_task_has_its_own_settings_and_all_that_was_typed() -> None:
 def test_a_gymnasium_id_is_a_task_of_its_own() -> None:
     (config,) = each("envs=gym/FetchReach-v4")
     assert (config.env.id, config.env.full_name) == ("FetchReach-v4", "gym_FetchReach-v4")
+
+
+def test_an_expert_is_of_gymnasiums_environments_alone() -> None:
+    gym, push = each("envs=gym/FetchReach-v4,block_push_easy", "expert=gym_examples:reach", "env.success=won")
+    assert (gym.env.expert, gym.env.success) == ("gym_examples:reach", "won")
+    assert (push.env.expert, push.env.success) == ("", "")
+    with pytest.raises(ConfigError, match=r"env\.expert"):
+        each("envs=block_push_easy", "expert=gym_examples:reach")
 
 
 def test_a_varied_task_has_a_name_and_a_folder_of_its_own() -> None:
@@ -130,6 +138,15 @@ def test_the_page_of_tasks_shows_them(results: list[dict[str, Any]], tmp_path: P
     said = "PlaySlot is ahead of all methods on the labels alone in 1 of 2 tasks, by intervals that leave out 0 in 1;"
     assert f"{said} not in hard." in table
     assert "| hard | – |" in page.partition("## Over tasks\n")[2], "the oracle was not measured there"
+
+
+def test_a_task_without_success_is_said_to_be_measured_by_return(results: list[dict[str, Any]]) -> None:
+    joint, line = joint_table(results, "playslot"), "Of hard no success is measured, but the return"
+    for returns in (False, True):
+        for cell in (cell for cell in joint["cells"] if returns and cell["env"] == "hard"):
+            cell["success_rate"] = None
+        page = to_markdown(tasks_page({**results[0], "across_tasks": joint, "errors": {}, "blocks": []}))
+        assert (line in page) == returns
 
 
 def test_ahead_by_an_episode_is_not_surely_ahead(tmp_path: Path) -> None:

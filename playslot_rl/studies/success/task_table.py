@@ -132,6 +132,9 @@ def tasks_page(result: Result) -> Document:
         f"The {IQM} is over the policies of all tasks."
     )
     errors = [f"**{task}: {error}**" for task, error in result["errors"].items()]
+    done = [cell for cell in result["across_tasks"]["cells"] if cell["runs"]]
+    if returns := dict.fromkeys(cell["env"] for cell in done if cell["success_rate"] is None):
+        errors.append(f"Of {', '.join(returns)} no success is measured, but the return, in `TASK/comparison.md`.")
     sections = [
         *task_sections(result["across_tasks"]),
         Section(FOOTNOTES, [Notes([*errors, f"{machine_note(result)}."])]),
