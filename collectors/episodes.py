@@ -85,7 +85,7 @@ class SeededView(TensorView):
         shown = task_env(self.env).expert_action() if self.asks else np.zeros(space.shape or (), space.dtype)
         if np.shape(shown) != space.shape or not np.isfinite(shown).all():
             raise ConfigError(
-                f"env: got {shown!r} from the task's expert_action, expected {space.shape} finite numbers in [-1, 1]"
+                f"env: got {shown!r} from the task's expert_action, expected {space.shape} finite numbers: mend it"
             )
         return {
             **super().view(observation, info),

@@ -248,7 +248,7 @@ def check_task(env: EnvConfig, expert: bool = False, success: bool = False) -> N
     if env.name == GYM.name:
         from playslot_rl.envs import gym_task
 
-        gym_task.warn_of_success(env)
+        gym_task.warn_of_success(env.id, env.success)
         if expert:
             gym_task.check_expert(env)
         if success:
@@ -265,9 +265,7 @@ def _check_variation(env: EnvConfig) -> None:
     if env.variation.on and not _in_mujoco(env):
         raise ConfigError(f"{got}, expected none: {task} draws itself")
     if env.name == GYM.name and (env.variation.textures or env.variation.colours):
-        raise ConfigError(
-            f"{got}, expected no textures and colours with {task}, whose parts nobody names: leave them out"
-        )
+        raise ConfigError(f"{got}, expected neither textures nor colours: {task} names no parts; leave them off")
 
 
 def has_parts(env: EnvConfig) -> bool:

@@ -5,6 +5,7 @@ Shapes: A = numbers of the Box, S = numbers of the environment's own observation
 
 from __future__ import annotations
 
+import functools
 import importlib
 import warnings
 from collections.abc import Callable, Sequence
@@ -90,12 +91,13 @@ def check_expert(env: EnvConfig) -> None:
         task.inner.close()
 
 
-def warn_of_success(env: EnvConfig) -> None:
-    """Warn where no step of a trial had `env.success` in its info: an entry that comes late, or is misspelt."""
-    entries = facts(env.id).entries
-    if env.success and env.success not in entries:
+@functools.cache
+def warn_of_success(name: str, success: str) -> None:
+    """Warn, once, where no step of a trial had `env.success` in its info: an entry that comes late, or is misspelt."""
+    entries = facts(name).entries
+    if success and success not in entries:
         warnings.warn(
-            f"env.success={env.success}: got no such entry in the info of a trial of {env.id}, expected one of "
+            f"env.success={success}: got no such entry in the info of a trial of {name}, expected one of "
             f"{', '.join(entries) or 'those that it has'}, or one that comes later: nothing is a success where it "
             "is missing",
             RuntimeWarning,

@@ -1,7 +1,8 @@
 """The `playslot` command: a thin front of the recipes.
 
 Every sub-command is one module of `playslot_rl.recipes`; its arguments are `key=value` overrides.
-Exit codes: 0 done, 1 an error, 2 arguments that cannot be read, 130 interrupted, 141 standard output closed.
+Exit codes: 0 done, 1 an error, 2 arguments refused when they are read, 130 interrupted, 141 standard
+output closed.
 """
 
 from __future__ import annotations

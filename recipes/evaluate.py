@@ -11,7 +11,7 @@ from typing import Any
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, method_stage
-from playslot_rl.envs import PROCEDURAL, RECORDED
+from playslot_rl.envs import PROCEDURAL, RECORDED, check_task
 from playslot_rl.errors import CheckpointError, ConfigError
 from playslot_rl.recipes import objects
 from playslot_rl.runs import Run
@@ -56,7 +56,10 @@ def _success(config: ExperimentConfig, run: Run, report: bool) -> None:
     own = METHODS[config.method].imagines
     if not own:
         check_baseline_protocol(config)
-    _require_policy(config, run)
+    trained = _require_policy(config, run)
+    check_task(config.env)
+    if config.env.seen != trained.seen:
+        print(f"note: evaluated with {config.env.seen}; run={config.run} was trained with {trained.seen}", flush=True)
     device = open_device(config.device, config.threads)
     agent = run.load_agent(device) if own else None
     with TaskPool(config.acting, config.render) as pool:
@@ -72,15 +75,14 @@ def _success(config: ExperimentConfig, run: Run, report: bool) -> None:
             print(f"report: {write_report(run.folder, agent=agent, pool=pool)}")
 
 
-def _require_policy(config: ExperimentConfig, run: Run) -> None:
-    """Refuse a run without a policy, or of another task, before anything is loaded."""
+def _require_policy(config: ExperimentConfig, run: Run) -> EnvConfig:
+    """What a run's policy was trained in; refuses one without, or of another task, before anything is loaded."""
     from playslot_rl.evaluation.success import run_facts
 
     run_facts(run.folder, config.method)
     trained = run.own(method_stage(config.method)).group(EnvConfig, "env")
     require_task(config, trained)
-    if config.env.seen != trained.seen:
-        print(f"note: evaluated with {config.env.seen}; run={config.run} was trained with {trained.seen}", flush=True)
+    return trained
 
 
 def error_of_actions(config: ExperimentConfig, run: Run) -> None:

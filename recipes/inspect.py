@@ -76,7 +76,7 @@ def main_if_needed(config: ExperimentConfig) -> None:
 
     run = Run.open(config.run)
     stored = run.result(RESULT, facts(config, run))
-    if stored is not None:
+    if stored is not None and ("code_actions" in stored["details"] or "code_counts" not in stored["details"]):
         print(f"inspect: made before, skipped\n{concluded(stored)}", flush=True)
         return
     try:

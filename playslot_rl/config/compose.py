@@ -134,8 +134,7 @@ def compose_each(overrides: Sequence[str], command: str = "") -> list[Experiment
     """The config of a command, or with `envs=metaworld/drawer-open,block_push_easy` one for each task; a ConfigError as
     of `compose`, and for keys that are of one task.
     """
-    typed = _short_keys(overrides, command)
-    pairs = dict(argument.partition("=")[::2] for argument in typed)
+    pairs = dict(argument.partition("=")[::2] for argument in _short_keys(overrides, command))
     names = pairs.get("compare.envs", "").strip().removeprefix("[").removesuffix("]")
     if command != "compare" or not names.strip():
         return [compose(overrides, command)]
@@ -146,9 +145,9 @@ def compose_each(overrides: Sequence[str], command: str = "") -> list[Experiment
     gym, found = any(env == GYM for env, _, _ in tasks), []
     for env, slash, own in tasks:
         chosen = [f"{'env.id' if env == GYM else 'env.task'}={own}"] if slash else []
-        others = ("env.expert", "env.success") if gym and env != GYM else ()  # of Gymnasium's environments alone
-        keys = [argument for argument in typed if argument.partition("=")[0] not in others]
-        found.append(compose([*keys, f"env={env}", *chosen], command))
+        others = ("expert", "env.expert", "env.success") if gym and env != GYM else ()  # of Gymnasium's alone
+        own_keys = [one for one in overrides if one.partition("=")[0].strip().lstrip("+") not in others]
+        found.append(compose([*own_keys, f"env={env}", *chosen], command))
     return found
 
 

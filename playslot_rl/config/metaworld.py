@@ -100,14 +100,9 @@ def several(task: str) -> tuple[str, ...]:
     return SETS.get(task, tuple(task.split(JOINT)) if JOINT in task else ())
 
 
-def names(task: str) -> tuple[str, ...]:
-    """A task alone, or those of a set."""
-    return several(task) or (task,)
-
-
 def has_small(task: str) -> bool:
     """Whether it is of `SMALL`, or a set with some."""
-    return any(name.removesuffix(VERSION) in SMALL for name in names(task))
+    return any(name.removesuffix(VERSION) in SMALL for name in several(task) or (task,))
 
 
 def seen_by(task: str, camera: str) -> str:

@@ -13,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.config import EnvConfig, ExperimentConfig, from_dict, metaworld
-from playslot_rl.config.env import VariationConfig
+from playslot_rl.config import EnvConfig, ExperimentConfig, metaworld, to_dict
 from playslot_rl.config.weights import DataRoot, data_roots
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import Cache
@@ -95,28 +95,34 @@ def draw_episodes(
     return order[position].astype(np.int64), offset.astype(np.int64)
 
 
-def _require_view(env: EnvConfig, root: str, demos: bool) -> None:
-    """Refuse frames of the task that our collectors recorded by another camera than `env.camera`, and demonstrations of
-    another of Gymnasium's environments, by a DataError; say where these vary otherwise (`env.variation`).
-    """
+def _recorded(root: str) -> list[dict[str, Any]]:
+    """`env` of our collections that a data set is of, as plain values."""
     record = read_record(Path(root).expanduser()) or {}
-    recorded = [(entry.get("spec") or {}).get("env") or {} for entry in (record, *(record.get("sources") or ()))]
-    for seen in (seen for seen in recorded if seen.get("name") == env.name):
-        if demos and seen.get("id", "") != env.id:
-            raise DataError(f"{root}: got demonstrations of env.id={seen.get('id')}, expected those of env.id={env.id}")
-        task = str(seen.get("task", ""))
-        if demos and task and not {*metaworld.names(task)} & {*metaworld.names(env.task)}:
-            continue  # refused by what is done in them (`playslot_rl.data.tasks`)
-        got, expected = seen.get("camera", ""), metaworld.seen_by(task, env.camera)
-        if got != expected:
+    found = [(entry.get("spec") or {}).get("env") or {} for entry in (record, *(record.get("sources") or ()))]
+    return [seen for seen in found if isinstance(seen, dict)]
+
+
+def _require_view(env: EnvConfig, root: str) -> None:
+    """Refuse frames of the task that our collectors recorded by another camera than `env.camera`, by a DataError."""
+    for seen in _recorded(root):
+        got, expected = seen.get("camera", ""), metaworld.seen_by(str(seen.get("task", "")), env.camera)
+        if seen.get("name") == env.name and got != expected:
+            known = metaworld.seen_by(env.task, got) == got
             raise DataError(
-                f"{root}: got frames recorded with env.camera={got}, expected env.camera={expected}: record them anew, "
-                f"or set env.camera={got} here and wherever the model acts"
+                f"{root}: got frames recorded with env.camera={got}, expected env.camera={expected}: record them anew"
+                + (f", or set env.camera={got} here and wherever the model acts" if known else ", or name others")
             )
-        varied = from_dict(VariationConfig, seen.get("variation") or {})
-        if demos and varied != env.variation:
-            words = [" ".join(one.words) or "nothing" for one in (varied, env.variation)]
-            say_once(f"note: {root}: env.variation was {words[0]} in these demonstrations, and is {words[1]} here")
+
+
+def say_unlike(env: EnvConfig, roots: str) -> None:
+    """Say where our collectors recorded demonstrations in another of Gymnasium's environments, or varied otherwise."""
+    for root in data_roots(roots):
+        for seen in (seen for seen in _recorded(root.path) if seen.get("name") == env.name):
+            varied = {key: value for key, value in (seen.get("variation") or {}).items() if value and key != "seed"}
+            own = {key: value for key, value in to_dict(env.variation).items() if value and key != "seed"}
+            for key, got, here in (("env.id", seen.get("id", ""), env.id), ("env.variation", varied, own)):
+                if got != here:
+                    say_once(f"note: {root.path}: demonstrations of {key}={got or 'off'}, taken for {here or 'off'}")
 
 
 def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:
@@ -133,9 +139,9 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         parts = [open_configured(config, [root.path]) for root in named]
         return weighted(parts, [root.weight for root in named])
     data, size = config.data, config.env.image_size
-    paths, demos = [root.path for root in named], {root.path for root in data_roots(data.demos)}
+    paths = [root.path for root in named]
     for path in paths:
-        _require_view(config.env, path, path in demos)
+        _require_view(config.env, path)
     buffer = data.shuffle_buffer if data.stream else None
     source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
     return every(source, data.stride, data.stride_action)

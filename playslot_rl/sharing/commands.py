@@ -96,6 +96,7 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any], other: Ex
     count = [] if episodes is None else [f"episodes={episodes}"]
     start = [f"seed={recorded['seed']}"] if recorded else seeded
     recording = [text for text in changed if text.startswith(("env.", "render.", "collect."))]
+    recording = [text for text in recording if not text.startswith("env.max_steps=")]  # of `collect.expert_steps`
     return [
         _line("collect", *base, "policy=expert", *count, *start, *recording, f"out={DEMOS}"),
         _line("train-policy", "run=pretrained", *base, *seeded, *first, *changed, f"data.demos={DEMOS}", f"out={RUN}"),

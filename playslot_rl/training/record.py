@@ -25,6 +25,7 @@ from playslot_rl.data.drawn_clips import DrawnClips
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.tasks import require_tasks, say_untaught
 from playslot_rl.data.videos import open_videos
+from playslot_rl.data.weighted import say_unlike
 from playslot_rl.errors import CheckpointError, DataError, OutputError
 from playslot_rl.runs import Run
 from playslot_rl.runs.opening import STAGE_LOCK
@@ -122,6 +123,7 @@ class StageRecord:
         acted = self.spec.data == "labelled"
         found = split_demonstrations(self.videos, config.demos, data.held_out, most, data.draw, acted)
         require_tasks(found.trained, config.env)
+        say_unlike(config.env, self.roots)
         say_untaught(found.trained, config.env, config.behaviour.labelled_demos if self.spec.some_labelled else None)
         if found.trained.limits is not None:  # a robot's own actions
             say_averaged(data)

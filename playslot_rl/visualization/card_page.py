@@ -57,7 +57,7 @@ def told_text(result: Mapping[str, Any]) -> str:
 def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> Document:
     """The page of `inspect`: of the card and its stored `result` (`card_json`)."""
     pictures = _pictures(card, model)
-    sections = [Section(group, blocks + pictures.get(group, [])) for group, blocks in _groups(result)]
+    sections = [Section(group, [table, *more, *pictures.get(group, [])]) for group, table, more in _groups(result)]
     lead = (
         f"World model of `{result['run']}`: {verdict_text(result)}. {told_text(result)} A verdict is a rule "
         "of thumb; the borders are in the columns `good` and `bad`, what lies between is fair."
@@ -65,15 +65,15 @@ def card_document(result: Mapping[str, Any], card: Card, model: WorldModel) -> D
     return Document("PlaySlot report card", lead, sections)
 
 
-def _groups(result: Mapping[str, Any]) -> list[tuple[str, list[Block]]]:
-    """Each group of lines with its table, and what a stored card has beside them."""
+def _groups(result: Mapping[str, Any]) -> list[tuple[str, Table, list[Block]]]:
+    """Each group of lines, its table, and what a stored card has beside it."""
     details = result["details"]
     beside = {
         LATENTS: [*_usage(details.get("code_counts", [])), *_code_table(details.get("code_actions", []))],
         ACTIONS: [*_probe_table(details.get("probes", {})), *_slot_table(details.get("telling_slots", []))],
         EFFECTS: _prototype_table(details.get("prototypes", [])),
     }
-    return [(group, [table, *beside.get(group, [])]) for group, table in card_tables(result["lines"])]
+    return [(group, table, beside.get(group, [])) for group, table in card_tables(result["lines"])]
 
 
 def _pictures(card: Card, model: WorldModel) -> dict[str, list[Block]]:
@@ -200,7 +200,6 @@ def card_section(given: ReportInput) -> Section:
     if result["fingerprints"] != prints:
         return Section(title, [Missing("The report card is that of another world model.", command)])
     blocks: list[Block] = [Text(f"{verdict_text(result)}. {told_text(result)}")]
-    for group, (table, *beside) in _groups(result):
-        assert isinstance(table, Table)
+    for group, table, beside in _groups(result):
         blocks += [Table([group, *table.headers[1:]], table.rows), *beside]
     return Section(title, [*blocks, Text("With pictures: `inspect/inspect.html`.")])

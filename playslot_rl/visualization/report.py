@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -113,8 +113,9 @@ def settings_section(given: ReportInput) -> Section:
         what = f"{len(seeds)} seeds from {min(seeds)} to {max(seeds)}, {seconds(result.get('wall_seconds'))}"
         drawn = result.get("render", {}).get("quality", given.config.render.quality)
         how = f"at most {given.steps(result)} agent steps, rendering `{drawn}`"
-        if "env" in result and (seen := from_dict(EnvConfig, result["env"]).seen) != given.config.env.seen:
-            how += f", **seen with {seen}**"
+        with suppress(ValueError, KeyError):  # of an earlier version
+            seen = from_dict(EnvConfig, result["env"]).seen
+            how += f", **seen with {seen}**" if seen != given.config.env.seen else ""
         measured.append([f"evaluation, {protocol}", f"{what}, {result.get('redrawn', 0)} redrawn, {how}"])
     return Section(
         "Settings and notes", [part.settings_table(model, task, measured), *(Text(note) for note in notes(given))]

@@ -20,7 +20,7 @@ from playslot_rl.data.clips import Clips
 from playslot_rl.data.slot_cache import slot_cache
 from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.data.views import concatenate, episode_range, split_tested, views_of_one
-from playslot_rl.data.weighted import open_configured, weighted
+from playslot_rl.data.weighted import open_configured, say_unlike, weighted
 from playslot_rl.errors import DataError
 from playslot_rl.modules.savi import SAVi
 from playslot_rl.testing import tiny_config
@@ -185,7 +185,16 @@ def test_slots_are_parsed_once_for_each_set_whatever_the_weights(
     ("recorded", "asked", "message"),
     [
         ({"task": "reach"}, {"task": "reach", "camera": "near"}, "recorded with env.camera=, expected env.camera=near"),
-        ({"task": "push", "camera": "near"}, {"task": "push"}, "recorded with env.camera=near, expected env.camera="),
+        (
+            {"task": "push", "camera": "near"},
+            {"task": "push"},
+            "expected env.camera=: record them anew, or set",
+        ),
+        (
+            {"task": "push", "camera": "near"},
+            {"task": "drawer-open"},
+            "expected env.camera=: record them anew, or name",
+        ),
         ({"task": "drawer-open"}, {"task": "reach+drawer-open", "camera": "near"}, ""),
         ({"task": "reach", "camera": "near"}, {"task": "reach+drawer-open", "camera": "near"}, ""),
     ],
@@ -204,24 +213,21 @@ def test_frames_of_another_view_of_the_task_are_refused(
         open_configured(config, str(root))
 
 
-def test_demonstrations_of_another_gymnasium_task_are_refused_and_varied_ones_said(
+def test_demonstrations_that_were_recorded_otherwise_are_said(
     foreign_images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Videos may be of any."""
     root = shutil.copytree(foreign_images, tmp_path / "set")
-    seen = {"name": "gym", "id": "FetchReach-v4", "variation": {"background": True}}
+    seen = {"name": "gym", "id": "FetchReach-v4", "variation": {"background": True, "seed": 3}}
     (root / "meta/playslot.json").write_text(json.dumps({"episodes": [], "spec": {"env": seen}}))
-    data = DataConfig(cache=str(tmp_path / "cache"), resize=True, demos=str(root))
-    config = replace(tiny_config(), data=data, env=EnvConfig("gym", image_size=32, id="FetchPush-v4"))
-    with pytest.raises(DataError, match=r"env\.id=FetchReach-v4, expected those of env\.id=FetchPush"):
-        open_configured(config, str(root))
-    assert open_configured(replace(config, data=replace(data, demos="")), str(root)).episodes
-    config = replace(config, env=replace(config.env, id="FetchReach-v4"))
-    open_configured(config, str(root))
-    assert "env.variation was background in these demonstrations, and is nothing here" in capsys.readouterr().err
-    same = VariationConfig(background=True)
-    open_configured(replace(config, env=replace(config.env, variation=same, frame_skip=1)), str(root))
-    assert "env.variation" not in capsys.readouterr().err
+    for typed, said in (
+        ({"id": "FetchReach-v4"}, "demonstrations of env.variation={'background': True}, taken for off"),
+        ({"id": "Reacher-v5"}, "demonstrations of env.id=FetchReach-v4, taken for Reacher-v5"),
+    ):
+        say_unlike(EnvConfig("gym", **typed), f"{root}:2")
+        assert said in capsys.readouterr().err
+    say_unlike(EnvConfig("gym", id="FetchReach-v4", variation=VariationConfig(background=True)), str(root))
+    say_unlike(EnvConfig("button_press"), str(root))
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize("order", [("pan", "lift"), ("lift", "pan"), ("x", "y")])

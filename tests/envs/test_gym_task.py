@@ -229,7 +229,7 @@ def test_a_camera_or_a_variation_that_there_is_not_is_refused_before_anything_is
         (line(variation=varied), r"env\.variation: got background, .* draws itself"),
         (
             line(id="FetchReach-v4", action_dim=4, variation=VariationConfig(textures=True)),
-            "env.variation: got textures, expected no textures and colours",
+            "env.variation: got textures, expected neither textures",
         ),
         (line(id="FetchReach-v4", action_dim=4, camera="hed_camera_rgb"), "did you mean env.camera=head_camera_rgb"),
     ):
@@ -289,11 +289,14 @@ def test_success_may_be_said_in_the_last_step_alone(name: str, says: str, typed:
 def test_a_success_that_no_info_has_is_warned_of() -> None:
     """It may come later than in a trial, or never."""
     told = gym_examples.register("LineTold-v0", says="won")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        facts(told)
     with pytest.warns(RuntimeWarning, match=r"env\.success=wonn: got no such entry in .* one of won"):
         check_task(line(id=told, success="wonn"))
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        facts(told)
+        check_task(line(id=told, success="wonn"))  # once is enough
         check_task(line(id=told, success="won"))
 
 
@@ -309,7 +312,7 @@ def test_numbers_that_are_none_are_refused_where_they_come(lost: str) -> None:
 def test_a_misspelt_id_names_what_can_be_typed() -> None:
     gym_examples.register("LineOld-v0")
     gym_examples.register("LineOld-v1")
-    with pytest.raises(ConfigError, match=r"the nearest are .*gym_examples:LineOld-v1, gym_examples:"):
+    with pytest.raises(ConfigError, match=r"nearest are (?!.*LineOld-v0).*gym_examples:LineOld-v1"):
         facts("gym_examples:LineOdl-v0")
 
 

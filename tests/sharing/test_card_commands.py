@@ -195,6 +195,7 @@ KINDS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "another view": policy_of("env=metaworld", "env.task=drawer-open", "env.camera=corner2"),
     "a view of before": policy_of("env=metaworld", "env.task=reach+push", "env.camera="),
     "shipped world model": policy_of(shipped_world_model=True, recorded={"episodes": 6, "seed": 7}, seed=7),
+    "shorter evaluation": policy_of("env.max_steps=4", shipped_world_model=True, recorded={"episodes": 6, "seed": 7}),
     "demonstrations of a robot": policy_of(shipped_world_model=True, recorded_elsewhere=True, world_model_seed=3),
     "resized": policy_of("data.resize=true", "env.image_size=32", "model.savi.encoder_strides=[2,2,1]"),
     "strided": policy_of("data.stride=3", "env.max_steps=7"),
@@ -224,7 +225,9 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
         last = compose(arguments, command)
         if command == "pipeline":
             gym_id(last.env.name)
-        elif command != "collect":
+        elif command == "collect":
+            assert last.collect.expert_steps == config.collect.expert_steps, "however long episodes of evaluation are"
+        else:
             assert last.data.demos or last.data.root
         write_json(Path(last.out) / "config.json", to_dict(last))  # what the command leaves
     assert (commands[-1][0], last.out) in (("pipeline", "runs/again"), ("train-policy", "runs/again"))

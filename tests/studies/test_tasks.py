@@ -49,7 +49,8 @@ def test_a_gymnasium_id_is_a_task_of_its_own() -> None:
 
 
 def test_an_expert_is_of_gymnasiums_environments_alone() -> None:
-    gym, push = each("envs=gym/FetchReach-v4,block_push_easy", "expert=gym_examples:reach", "env.success=won")
+    typed = ("expert=gym_examples:reach", "+env.success=won", "hydra.launcher=joblib", "hydra.launcher.n_jobs=${x.y}")
+    gym, push = each("envs=gym/FetchReach-v4,block_push_easy", *typed)
     assert (gym.env.expert, gym.env.success) == ("gym_examples:reach", "won")
     assert (push.env.expert, push.env.success) == ("", "")
     with pytest.raises(ConfigError, match=r"env\.expert"):
