@@ -115,8 +115,6 @@ def compose(overrides: Sequence[str] = (), command: str = "") -> ExperimentConfi
             config, typed = _from_run(Path(run), pairs, command == "play"), _typed(pairs)
         else:
             values, typed = _presets(pairs.get("env", PLAIN_ENV), pairs.get("preset", PRESET)), _typed(pairs)
-            if command == "collect" and (steps := typed.get("env", {}).get("max_steps")):  # it has no other use there
-                typed = merged({"collect": {"random_steps": steps, "expert_steps": steps}}, typed)
             config = from_dict(ExperimentConfig, _with_task(values, typed))
             if config.env.id and not {"env.action_dim", "env.max_steps"} <= pairs.keys():  # only the environment knows
                 config = from_dict(ExperimentConfig, _with_task(values, typed, plugins.call(FITTED, config.env)))
@@ -136,6 +134,9 @@ def compose_each(overrides: Sequence[str], command: str = "") -> list[Experiment
     """
     pairs = dict(argument.partition("=")[::2] for argument in _short_keys(overrides, command))
     names = pairs.get("compare.envs", "").strip().removeprefix("[").removesuffix("]")
+    if command == "collect" and "env.max_steps" in pairs:  # of evaluation, which there is none of
+        lengths = {f"collect.{policy}_steps": pairs["env.max_steps"] for policy in ("random", "expert")}
+        overrides = [*overrides, *(f"{key}={steps}" for key, steps in lengths.items() if key not in pairs)]
     if command != "compare" or not names.strip():
         return [compose(overrides, command)]
     for key in ("env", "env.task", "env.id", "data.root", "data.demos"):

@@ -20,7 +20,7 @@ from playslot_rl.config import (
     to_dict,
 )
 from playslot_rl.config.baselines import baselines_of
-from playslot_rl.config.compose import choices, compose
+from playslot_rl.config.compose import choices, compose, compose_each
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import UNSAID, Checked, keys_of, naming, without
 from playslot_rl.errors import ConfigError
@@ -428,6 +428,6 @@ def test_a_value_outside_its_range_is_refused_by_its_full_name(argument: str, me
 def test_collect_records_episodes_as_long_as_is_typed() -> None:
     """Elsewhere `env.max_steps` is of evaluation."""
     for env in ("env=metaworld", "env=ogbench", "env=button_press"):
-        steps = compose([env, "env.max_steps=7", "collect.random_steps=9"], "collect").collect
-        assert (steps.random_steps, steps.expert_steps) == (9, 7)
+        (config,) = compose_each([env, "env.max_steps=7", "collect.random_steps=9"], "collect")
+        assert (config.collect.random_steps, config.collect.expert_steps) == (9, 7)
         assert compose([env, "env.max_steps=7"], "pipeline").collect.expert_steps > 7

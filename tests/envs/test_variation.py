@@ -152,13 +152,13 @@ def test_of_a_gymnasium_robot_planes_and_sky_alone_are_painted_over(name: str) -
     for shift in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         kept &= ~np.roll(free, shift, (0, 1))
     assert kept.sum() > 20
-    for painted in ({"background": True, "textures": True, "colours": 1.0}, ALL):
+    for painted in ({"background": True}, {**ALL, "textures": False, "colours": 0.0}):
         varied = make_env(replace(task.config, variation=VariationConfig(**painted))).unwrapped
         other = varied.reset(seed=0)[0]
         np.testing.assert_array_equal(first[keys.STATE], other[keys.STATE])
         changed = np.abs(first["pixels"].astype(int) - other["pixels"]).max(axis=-1) > 0
         assert changed[free].mean() > 0.3
-        if painted is not ALL:
+        if "shake" not in painted:
             assert changed[kept].mean() < 0.05
         varied.close()
     task.close()

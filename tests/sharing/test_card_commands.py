@@ -21,7 +21,7 @@ from commands import playslot, smoke
 from recordings import FPS, trained, write_recordings
 
 from playslot_rl.config import to_dict
-from playslot_rl.config.compose import choices, compose
+from playslot_rl.config.compose import choices, compose, compose_each
 from playslot_rl.config.plain import flatten
 from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL, RECORDED, gym_id
 from playslot_rl.sharing.commands import GROUPS, reproduce
@@ -222,7 +222,7 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
     last: Any = None
     commands = [shlex.split(line)[1:] for line in reproduce(config, source, [])]
     for command, *arguments in commands:
-        last = compose(arguments, command)
+        last = compose_each(arguments, command)[0]
         if command == "pipeline":
             gym_id(last.env.name)
         elif command == "collect":
