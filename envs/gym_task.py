@@ -5,11 +5,10 @@ Shapes: A = numbers of the Box, S = numbers of the environment's own observation
 
 from __future__ import annotations
 
-import functools
 import importlib
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -91,7 +90,7 @@ def check_expert(env: EnvConfig) -> None:
         task.inner.close()
 
 
-@functools.cache
+@cache
 def warn_of_success(name: str, success: str) -> None:
     """Warn, once, where no step of a trial had `env.success` in its info: an entry that comes late, or is misspelt."""
     entries = facts(name).entries

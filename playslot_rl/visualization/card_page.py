@@ -31,10 +31,13 @@ def card_tables(lines: Sequence[Mapping[str, Any]]) -> list[tuple[str, Table]]:
     return [(group, Table(headers, [_row(one) for one in lines if one["group"] == group])) for group in groups]
 
 
+def _rounded(value: float | None) -> str:
+    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"
+
+
 def _row(one: Mapping[str, Any]) -> list[str]:
-    value = "–" if one["value"] is None else f"{round(one['value'], 2) + 0.0:.2f}"
     note = f"not measured: {one['note']}" if one["value"] is None else str(one["note"])
-    return [one["measure"], value, VERDICTS[one["verdict"]], one["good"], one["bad"], note]
+    return [one["measure"], _rounded(one["value"]), VERDICTS[one["verdict"]], one["good"], one["bad"], note]
 
 
 def verdict_text(result: Mapping[str, Any]) -> str:
@@ -173,7 +176,7 @@ def _probe_table(probes: Mapping[str, Any]) -> list[Block]:
         return []
     kinds = {"linear": "linear", "mlp": "two-layer network"}
     r2 = {said: probes["latent"][kind]["r2"] for kind, said in kinds.items()}
-    rows = [[said, *("–" if v is None else f"{round(v, 2) + 0.0:.2f}" for v in values)] for said, values in r2.items()]
+    rows = [[said, *map(_rounded, values)] for said, values in r2.items()]
     headers = ["probe", *(f"action {n + 1}" for n in range(len(rows[0]) - 1))]
     return [Table(headers, rows, "R² of each number of the action; – where it hardly varies.")]
 
