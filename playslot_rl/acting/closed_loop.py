@@ -80,7 +80,8 @@ class ClosedLoop:
     def _fitted(self, frames: Tensor, name: str) -> Tensor:
         side = self._side or frames.shape[-1]
         if frames.ndim != 4 or frames.shape[1] != 3:
-            raise ValueError(f"{name}: got shape {tuple(frames.shape)}, expected (batch, 3, {side}, {side})")
+            other = ", or another height and width" if self._resize else ""
+            raise ValueError(f"{name}: got shape {tuple(frames.shape)}, expected (batch, 3, {side}, {side}){other}")
         if tuple(frames.shape[2:]) == (side, side):
             return frames
         if not self._resize:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 WIDE: Final = 3.0
 """Smallest to largest is so many times as wide as q01 to q99 where there may be outliers, and what is stated so many
 times as wide as the data where it is not believed."""
+UNITS: Final = 20.0
+"""Ranges so many times as wide are of another unit: degrees are 57 times as many as radians."""
 FEW: Final = 0.001
 """Share of the rows up to which values far outside q01 to q99 are outliers; more are a motion, such as a gripper's."""
 HUGE: Final = 1e30  # numbers that no robot knows: with them float32 would overflow
@@ -117,10 +119,24 @@ def limits_of(files: Contents, actions: Floats | None) -> ActionLimits | None:
 
 def _simulated(files: Contents, actions: Floats) -> bool:
     """Whether a set is of our own simulators: it is named as they are, and has our record or no value beyond 1."""
+    named = ours(str(files.info.get("robot_type") or ""))
+    return named and ((files.root / RECORD_NAME).is_file() or not (np.abs(actions) > 1).any())
+
+
+def ours(robot: str) -> bool:
+    """Whether a set's `robot_type` is one of our own simulators."""
     from playslot_rl.envs import ENVIRONMENTS, PROCEDURAL  # with Gymnasium
 
-    named = str(files.info.get("robot_type") or "") in (*ENVIRONMENTS, *PROCEDURAL)
-    return named and ((files.root / RECORD_NAME).is_file() or not (np.abs(actions) > 1).any())
+    return robot in (*ENVIRONMENTS, *PROCEDURAL)
+
+
+def other_units(span: Floats, other: Floats) -> bool:
+    """Whether the numbers of actions that change, ranges (A,) each, are all `UNITS` times as wide on the same side, as
+    degrees are beside radians.
+    """
+    change = (span > 0) & (other > 0)
+    ratio = span[change] / other[change]
+    return bool(change.any() and ((ratio > UNITS).all() or (ratio < 1 / UNITS).all()))
 
 
 def joined_limits(parts: Sequence[ActionLimits | None], width: int) -> ActionLimits | None:

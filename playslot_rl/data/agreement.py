@@ -217,7 +217,10 @@ def open_files(root: str | Path) -> Contents:
             "pull it by `playslot dataset pull USER/NAME DIR`"
         )
     if not folder.is_dir():
-        raise DataError(f"data.root={root}: no such folder, {expected} data set: run `playslot collect` first")
+        raise DataError(
+            f"{root}: no such folder, {expected} data set: check the path; `playslot collect` records one, "
+            "`playslot dataset pull USER/NAME DIR` downloads one of the Hub"
+        )
     if not (folder / INFO_NAME).is_file():
         cure = f"check data.root={clips_hint(folder)}"
         raise DataError(f"data.root={root}: got no {INFO_NAME}, {expected} v3.0 data set: {cure}")

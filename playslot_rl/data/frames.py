@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.contents import Contents, Span
 from playslot_rl.data.metadata import INFO_NAME, LARGEST_PICTURE, stated_size
 from playslot_rl.data.places import Problems
@@ -28,6 +29,7 @@ from playslot_rl.errors import DataError, first_line
 
 ROWS_A_PIECE = 256
 DAMAGED = "damaged frame"
+DARK = 4096  # of 65535: depth in millimetres
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF")  # Pillow knows more, and starts programs for some
 
 Decoded = Any  # pixels of an image, uint8 (H, W, 3), or (H, W) of a depth map; or PyAV's `VideoFrame`
@@ -69,6 +71,11 @@ def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
     if frame.ndim == 2 and frame.dtype not in (np.uint8, np.uint16):
         raise DataError(f"got a picture of {frame.dtype}, expected colours, or grey of 8 or 16 bits")
     if frame.ndim == 2:
+        if frame.dtype == np.uint16 and 0 < frame.max() < DARK:
+            say_once(
+                f"note: got 16-bit pictures below {DARK} of 65535, of which the upper eight bits are nearly black: "
+                "scale them (depth to what the robot's work spans), or choose another by data.camera="
+            )
         grey = frame if frame.dtype == np.uint8 else (frame >> 8).astype(np.uint8)
         frame = np.repeat(grey[..., None], 3, axis=-1)
     pixels: npt.NDArray[np.uint8] = frame

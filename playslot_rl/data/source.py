@@ -157,7 +157,8 @@ class EpisodeFrames:
         """The actions; a DataError where there are none, or some of another width."""
         if self.actions is None:
             raise DataError(
-                "got a data set without actions, expected the feature `action`: use labelled demonstrations"
+                "got a data set without actions, expected the feature `action`, of one width in all sets: use labelled "
+                "demonstrations"
             )
         if width is not None and self.actions.shape[1] != width:
             raise DataError(

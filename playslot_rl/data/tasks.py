@@ -56,13 +56,17 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
         say_once(
             f"note: {source.name}: got demonstrations of {len(tasks)} tasks ({tasks[0]!r}, {tasks[1]!r}, ...), which "
             "one policy is not told apart: "
-            + (f"tell it which by {_typed(tasks)}, or " if env.name == VIDEO and _can_be_typed(said) else "")
+            + (
+                f"tell it which by {_typed(tasks)} from train-slots on, or "
+                if env.name == VIDEO and _can_be_typed(said)
+                else ""
+            )
             + "train on those of one, a set that `playslot dataset split` makes without --fractions"
         )
 
 
 def _can_be_typed(said: set[str]) -> bool:
-    return all(task and JOINT not in task for task in said)
+    return all(task.strip() and JOINT not in task for task in said)
 
 
 def _typed(tasks: list[str]) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from playslot_rl.data.action_limits import joined_limits
+from playslot_rl.data.action_limits import joined_limits, other_units, said
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.turns import turns
 from playslot_rl.errors import DataError
@@ -189,7 +189,7 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
     """Refuse, by a DataError, one set twice, sets of other frame sizes or rates, or with the same actions in another
     order, with `weights` of other robots or widths of actions, too; what else is not as in the first is said."""
     first = sources[0]
-    known = {(first.fingerprint, first.camera)}
+    met = {(first.fingerprint, first.camera)}
     for source in sources[1:]:
         size, expected = ("x".join(map(str, each.image_size)) for each in (source, first))
         facts: list[tuple[str, object, object, str]] = [
@@ -204,18 +204,22 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
         names, others = (() if each.limits is None else each.limits.names for each in (source, first))
         if sorted(names) == sorted(others):
             facts.append(("actions in the order", ", ".join(names), ", ".join(others), ""))
+        known = [each.limits for each in (source, first) if each.limits is not None]
+        if len(names) == len(others) > 0 and other_units(*(limits.largest - limits.smallest for limits in known)):
+            own, there = (said(limits.plain()) for limits in known)
+            say_once(f"note: {source.name}: got {own}, in {first.name} {there}: are the units the same?")
         for what, got, want, cure in facts:
-            said = f"{source.name}: got {what} {got}, expected {want} as in {first.name}"
+            unlike = f"{source.name}: got {what} {got}, expected {want} as in {first.name}"
             if got != want and (weights or not cure):
-                raise DataError(f"{said}: read sets of one kind")
+                raise DataError(f"{unlike}: read sets of one kind")
             if got != want:
-                say_once(f"note: {said}: {cure}")
-        if (source.fingerprint, source.camera) in known:
+                say_once(f"note: {unlike}: {cure}")
+        if (source.fingerprint, source.camera) in met:
             raise DataError(
                 f"{source.name}: got the frames of {source.camera} twice, expected each recording once: leave one out "
                 "of data.root= or data.camera="
             )
-        known.add((source.fingerprint, source.camera))
+        met.add((source.fingerprint, source.camera))
         if source.name != first.name and source.camera != first.camera:
             seen = f"{source.name}: got frames of {source.camera}, expected {first.camera} as in {first.name}"
             say_once(f"note: {seen}: choose by data.camera=, unless they show the same view")

@@ -19,7 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, metaworld, to_dict
+from playslot_rl.config.env import VIDEO
 from playslot_rl.config.weights import DataRoot, data_roots
+from playslot_rl.data.action_limits import ours
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import Cache
 from playslot_rl.data.metadata import read_record
@@ -144,4 +146,12 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         _require_view(config.env, path)
     buffer = data.shuffle_buffer if data.stream else None
     source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
+    if (
+        config.env.name != VIDEO
+        and not ours(source.robot)
+        and not any(seen for path in paths for seen in _recorded(path))
+    ):
+        robot = f"robot_type={source.robot}" if source.robot else "no robot_type"
+        said = f"note: {source.name}: got {robot} and no record of ours, taken for recordings of env={config.env.name}"
+        say_once(f"{said}: a robot's own are read with env={VIDEO}, from the first stage on")
     return every(source, data.stride, data.stride_action)

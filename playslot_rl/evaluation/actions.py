@@ -29,7 +29,7 @@ from playslot_rl.acting.actor import Actor
 from playslot_rl.acting.closed_loop import ClosedLoop
 from playslot_rl.config import EnvConfig, ExperimentConfig, plugins
 from playslot_rl.config.methods import METHODS, cloning_methods
-from playslot_rl.data.action_limits import said, scaled
+from playslot_rl.data.action_limits import other_units, said, scaled
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.demonstrations import split_demonstrations, transitions
 from playslot_rl.data.source import EpisodeFrames
@@ -262,14 +262,23 @@ def measure_actions(
     }
 
 
-def _say_elsewhere(source: EpisodeFrames, taught: dict[str, Any] | None) -> None:
-    """Say which numbers of the actions never are between the taught ends (`ActionLimits.plain`): of another unit."""
+def _require_alike(source: EpisodeFrames, meta: Mapping[str, Any]) -> None:
+    """Refuse the taught actions in another order, by a DataError; say where the rate, or the unit, is another: the ends
+    (`ActionLimits.plain`) that some numbers never are between, or that all are far narrower or wider than."""
+    if (fps := meta.get("fps")) and f"{fps:g}" != f"{source.fps:g}":
+        say_once(f"note: {source.name}: got {source.fps:g} frames a second, where the policy was taught by {fps:g}")
+    taught = meta.get("actions")
     if not taught or not scaled(taught):
         return
-    low, high = np.asarray(taught["low"]), np.asarray(taught["high"])
+    names = () if source.limits is None else source.limits.names
+    if sorted(names) == sorted(taught["names"]) and [*names] != [*taught["names"]]:
+        got, expected = ", ".join(names), ", ".join(taught["names"])
+        raise DataError(f"{source.name}: got actions in the order {got}, expected {expected}, as the policy was taught")
+    low, high = (np.asarray(taught[end], np.float32) for end in ("low", "high"))
     actions = source.require_actions(len(low))
     least, most = np.nanmin(actions, 0), np.nanmax(actions, 0)
-    if len(far := np.flatnonzero((low < high) & ((least > high) | (most < low)))):
+    far = (low < high) & ((least > high) | (most < low) | other_units(high - low, most - least))
+    if len(far := np.flatnonzero(far)):
         met = ", ".join(f"{taught['names'][i]} {least[i]:.6g}..{most[i]:.6g}" for i in far)
         known = said({key: [taught[key][i] for i in far] for key in ("names", "low", "high")})
         say_once(f"note: {source.name}: got {met}, where the policy was taught {known}: are the units the same?")
@@ -306,7 +315,7 @@ def evaluate_actions(run: Run, config: ExperimentConfig, device: torch.device) -
             "actions: train it again"
         )
     recorded = Recorded.of(config, run, stages)
-    _say_elsewhere(recorded.source, taught.get("actions"))
+    _require_alike(recorded.source, taught)
     began, actor = time.perf_counter(), plugins.call(METHODS[config.method].load.actor, run, device)
     actor.eval()
     source = recorded.source

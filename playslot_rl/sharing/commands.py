@@ -120,6 +120,8 @@ def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any], other:
     if other is None:  # the world model's run says the rest
         own = [*([] if alike else _seeded(seed)), *behaviour]
     among = [demos, *behaviour] if DEMOS in videos.split(",") else []
+    if videos == VIDEOS and first.data.root == config.data.demos:  # one set for both: what is held out is of it
+        among = behaviour
     return [
         _line("train-slots", *_base(first), *_seeded(world), *settings, *among, f"out={folder}"),
         _line("train-dynamics", f"run={folder}"),

@@ -8,10 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from robot import robot_actions, write_robot
 
-from playslot_rl.data.action_limits import ActionLimits, joined_limits, limits_of, said, scaled
+from playslot_rl.config.compose import compose
+from playslot_rl.data.action_limits import ActionLimits, joined_limits, limits_of, other_units, said, scaled
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.source import labels_of
+from playslot_rl.data.weighted import open_configured
 
 
 def joints(rows: int = 400) -> np.ndarray[Any, Any]:
@@ -218,3 +221,31 @@ def test_plain_values_say_whether_anything_is_scaled(tmp_path: Path) -> None:
     assert not scaled(found(tmp_path, unit, names=None).plain())
     assert not scaled(None)
     assert said(None) == "[-1, 1]"
+
+
+@pytest.mark.parametrize(
+    ("span", "other", "unlike"),
+    [([180, 0, 100], [3.1, 0, 1.7], True), ([0.3, 0.2, 1], [300, 200, 1000], True), ([180, 0, 100], [90, 0, 1], False),
+     ([0, 0], [1, 1], False)],
+)  # fmt: skip
+def test_another_unit_is_one_of_all_that_changes(span: list[float], other: list[float], unlike: bool) -> None:
+    assert other_units(np.float32(span), np.float32(other)) == unlike
+
+
+def test_a_robots_sets_in_two_units_or_taken_for_a_simulators_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turned = robot_actions()
+    degrees = write_robot(tmp_path / "degrees", turned)
+    radians = write_robot(tmp_path / "radians", [np.radians(actions) for actions in turned])
+    own, simulated = compose(["preset=smoke", "env=video"]), compose(["preset=smoke"])
+    capsys.readouterr()  # LeRobot's own
+    open_configured(own, [degrees])
+    assert not capsys.readouterr().err
+    open_configured(own, [degrees, radians])
+    assert f"note: {radians}: got shoulder.pos " in (told := capsys.readouterr().err)
+    assert "are the units the same?" in told
+    open_configured(simulated, [degrees])
+    assert (
+        "got robot_type=arm and no record of ours, taken for recordings of env=button_press" in capsys.readouterr().err
+    )

@@ -70,6 +70,14 @@ def test_pictures_of_every_kind_are_read_as_what_they_show(name: str, broken: Pa
     assert not [line for line in verify(broken).errors if "decoded" in line]
 
 
+def test_depth_in_millimetres_is_said_to_be_nearly_black(
+    broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_picture(broken, encoded(Image.fromarray(DEEP // 64)))
+    assert open_sources(broken, cache=tmp_path / "cache").frames[6].max() < 4
+    assert "note: got 16-bit pictures below 4096 of 65535, " in capsys.readouterr().err
+
+
 def bomb(width: int, height: int) -> bytes:
     """A PNG of a megabyte at most that says, and holds, as many black pixels as it wants."""
 

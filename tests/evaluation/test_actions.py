@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,8 +12,10 @@ from torch import Tensor, nn
 
 from playslot_rl import keys
 from playslot_rl.acting.actor import ReactiveActor
+from playslot_rl.data.action_limits import ActionLimits
 from playslot_rl.data.source import EpisodeFrames
-from playslot_rl.evaluation.actions import _say_elsewhere, measure_actions
+from playslot_rl.errors import DataError
+from playslot_rl.evaluation.actions import _require_alike, measure_actions
 from playslot_rl.modules.action_range import ActionRange
 
 LENGTHS = (4, 3)
@@ -76,15 +80,40 @@ def test_the_constant_is_zero_and_no_error_is_one(actor: ReactiveActor) -> None:
     assert low < constant["mae"] < high
 
 
-def test_another_unit_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    taught = {"names": ["pan", "lift", "grip"], "low": [-90.0, -110.0, 1.0], "high": [50.0, -30.0, 1.0]}
-    for lift, said in ((-1.0, True), (-50.0, False)):
-        source = recorded([[0, 0]] * 7, [[np.nan] * 3, [0, lift, 5], *[[1, lift - 1, 5]] * 5])
-        _say_elsewhere(source, taught)
-        line = "got lift -2..-1, where the policy was taught lift -110..-30: are the units the same?"
-        assert (line in capsys.readouterr().err) == said
-    _say_elsewhere(source, None)
+TURNED = {"names": ["pan", "lift", "grip"], "low": [-90.0, -110.0, 1.0], "high": [50.0, 30.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "line"),
+    [
+        (
+            [0, 40, 5],
+            [40, 60, 5],
+            "got lift 40..60, where the policy was taught lift -110..30: are the units the same?",
+        ),
+        ([0, -70, 5], [40, -50, 5], ""),
+        ([0, -1, 5], [0.7, 0.5, 5], "got pan 0..0.7, lift -1..0.5, where the policy was taught pan -90..50, lift"),
+    ],
+)
+def test_another_unit_is_said(
+    first: list[float], other: list[float], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = recorded([[0, 0]] * 7, [[np.nan] * 3, first, *[other] * 5])
+    _require_alike(source, {"actions": TURNED})
+    assert line in (told := capsys.readouterr().err)
+    assert line or not told
+    _require_alike(source, {})
     assert not capsys.readouterr().err
+
+
+def test_actions_in_another_order_are_refused_and_another_rate_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    ends = np.float32([1, 1, 1])
+    source = recorded([[0, 0]] * 7, [[0, -70, 5], *[[40, -50, 5]] * 6])
+    source = replace(source, limits=ActionLimits(("lift", "pan", "grip"), -ends, ends, -ends, ends))
+    with pytest.raises(DataError, match="got actions in the order lift, pan, grip, expected pan, lift, grip, as"):
+        _require_alike(source, {"actions": TURNED})
+    _require_alike(source, {"fps": 30})
+    assert "got 10 frames a second, where the policy was taught by 30" in capsys.readouterr().err
 
 
 def test_actions_that_are_not_known_do_not_count(actor: ReactiveActor) -> None:

@@ -188,6 +188,9 @@ def test_what_does_not_fit_is_refused(folder: Path, loaded: tuple[Any, Any, Any]
     for frames in (torch.full((1, 3, 64, 64), 255.0), torch.full((1, 3, 64, 64), float("nan"))):
         with pytest.raises(ValueError, match=r"observation.images.front: got floats in .* expected \[0, 1\]"):
             policy.select_action({"observation.images.front": frames})
+    for frames in (torch.full((1, 3, 64, 64), 255), np.zeros((1, 3, 64, 64), np.float32)):
+        with pytest.raises(ValueError, match=r"front: got .*(int64|float32), expected a tensor of floats in"):
+            policy.select_action({"observation.images.front": frames})
     for refuse in (lambda: policy.forward({}), policy.get_optim_params, policy.config.get_optimizer_preset):
         with pytest.raises(NotImplementedError, match="playslot train-policy"):
             refuse()

@@ -244,6 +244,13 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
     assert "/home/me" not in str(commands)
 
 
+def test_what_is_held_out_of_one_set_for_videos_and_demonstrations_is_held_out_of_slots_too() -> None:
+    config = compose(["preset=smoke", "env=video", "data.root=/home/me/a", "data.demos=/home/me/a", "data.held_out=2"])
+    slots, _, policy = reproduce(config, {"seed": 3}, [])
+    assert "data.held_out=2" in slots.split()
+    assert "data.held_out=2" in policy.split()
+
+
 @pytest.mark.parametrize(
     ("typed", "commands"),
     [

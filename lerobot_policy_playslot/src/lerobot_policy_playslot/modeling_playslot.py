@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from lerobot.policies import PreTrainedPolicy
-from torch import Tensor
+from torch import Tensor, uint8
 
 from lerobot_policy_playslot.configuration_playslot import NOT_TRAINED_HERE, PlaySlotConfig
 from playslot_rl.acting.actor import told_as
@@ -55,6 +55,9 @@ class PlaySlotPolicy(PreTrainedPolicy):
                 f'observation: got {had}, expected {camera}: rename yours by --rename_map=\'{{"yours": "{camera}"}}\''
             )
         frames = batch[camera]
+        if not isinstance(frames, Tensor) or not (frames.is_floating_point() or frames.dtype == uint8):
+            got = getattr(frames, "dtype", type(frames).__name__)
+            raise ValueError(f"{camera}: got {got}, expected a tensor of floats in [0, 1], or of bytes (torch.uint8)")
         if frames.is_floating_point() and not bool(((frames >= 0) & (frames <= 1)).all()):
             low, high = frames.min().item(), frames.max().item()
             raise ValueError(f"{camera}: got floats in [{low:g}, {high:g}], expected [0, 1]: divide bytes by 255")
