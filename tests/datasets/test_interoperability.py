@@ -47,5 +47,5 @@ def test_ours_trains_on_what_lerobot_wrote(dtype: str, tmp_path: Path) -> None:
 
     root = write_foreign(tmp_path / "theirs", dtype, size=64)
     run = tmp_path / "run"
-    smoke("train-slots", f"data.root={root}", f"out={run}", "slots.steps=3")
+    smoke("train-slots", "env=video", f"data.root={root}", f"out={run}", "slots.steps=3")
     assert (run / "slots" / "checkpoint" / "weights.safetensors").is_file()

@@ -212,7 +212,9 @@ def test_an_edited_range_is_refused(policy: Path, tmp_path: Path) -> None:
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A set of a robot with four joints, for the methods that are compared in a simulator, and slots of its frames."""
     root = tmp_path_factory.mktemp("four")
-    arm = write_robot(root / "set", [episode[:, :4] for episode in robot_actions()], names=NAMES[:4])
+    arm = write_robot(
+        root / "set", [episode[:, :4] for episode in robot_actions()], names=NAMES[:4], robot="button_press"
+    )
     smoke("train-slots", f"data.root={arm}", f"out={root / 'run'}")
     smoke("train-dynamics", f"data.root={arm}", f"run={root / 'run'}")
     return arm, root / "run"
