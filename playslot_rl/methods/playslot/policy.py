@@ -38,8 +38,8 @@ def training(record: StageRecord) -> Training:
     """The frozen world model's view of the demonstrations; fresh policy, oracle and decoder on top of it."""
     config, split, device = record.config, record.demos, record.device
     behaviour = config.behaviour
-    require_labelled(behaviour.labelled_demos, split.trained.recordings)  # before anything is computed
-    split.trained.require_actions()
+    split.trained.require_actions()  # before anything is computed
+    require_labelled(behaviour.labelled_demos, split.trained.recordings)
     require_finite(split, None if behaviour.oracle else behaviour.labelled_demos)
     world = record.world.load_world_model(device)
     if (config.env.tasks or world.env.tasks) and not world.env.serves(config.env):

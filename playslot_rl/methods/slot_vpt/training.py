@@ -90,8 +90,8 @@ def training(record: StageRecord) -> Training:
     """The labeller, and the policy on what it says of all demonstrations."""
     config, device, split = record.config, record.device, record.demos
     own, width = config.behaviour, config.env.action_dim
-    require_labelled(own.labelled_demos, split.trained.recordings)  # before anything is computed
-    split.trained.require_actions(width)
+    split.trained.require_actions(width)  # before anything is computed
+    require_labelled(own.labelled_demos, split.trained.recordings)
     require_finite(split, own.labelled_demos)
     savi = record.world.load_savi(device)
     with global_seed(config.seed, 0, record.name):
