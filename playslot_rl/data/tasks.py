@@ -46,10 +46,12 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
     """
     said = {"nothing"} if source.tasks is None else {*source.tasks.tolist()}
     unknown = sorted(said - {*env.sentences} if env.tasks else said & env.other_sentences)
+    lost = sorted({*env.sentences} - said) if env.name == VIDEO else []
     if unknown:
         raise DataError(
             f"{source.name}: got demonstrations of {unknown[0]!r}, expected the tasks of env.task={env.task} alone: "
             + ("name it, too, or leave its episodes out" if env.name == VIDEO else "collect them with it")
+            + (f"; none are of {lost[0]!r}" if lost else "")
         )
     tasks = sorted(said - {""})
     if not env.tasks and len(tasks) > 1:

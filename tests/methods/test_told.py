@@ -195,7 +195,7 @@ def test_who_clones_several_tasks_untold_is_told_so(capsys: pytest.CaptureFixtur
     assert said.count("\n") == 1
     assert "env.task" not in said
     for tasks, cure in (
-        (["Wash up.", "Cook."] * 3, "tell it which by 'env.task=Cook.+Wash up.', or train on"),
+        (["Wash up.", "Cook."] * 3, "tell it which by 'env.task=Cook.+Wash up.' from train-slots on, or train on"),
         (["Wash up.", "Cook."] * 2 + ["", ""], "train on those of one"),  # what is not named cannot be typed
         (["Wash up.", "Cook.", "Mix A + B."] * 2, "train on those of one"),
     ):
@@ -240,6 +240,11 @@ def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
     for tasks in (None, np.array([*said[:5], "Dance."])):
         with pytest.raises(DataError, match=r"got demonstrations of '(nothing|Dance\.)', expected the tasks of"):
             told(replace(source, tasks=tasks))
+    robot = replace(source, tasks=np.array(["Open it.", "Close it."] * 3))
+    with pytest.raises(
+        DataError, match=r"of 'Close it\.', expected .* leave its episodes out; none are of 'close it\.'"
+    ):
+        require_tasks(robot, EnvConfig(name="video", task="close it.+Open it."))
 
 
 @pytest.mark.parametrize("method", ["act", "lapo", "playslot"])

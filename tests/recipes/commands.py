@@ -61,10 +61,12 @@ def instead(first: Sequence[object], *later: object) -> list[object]:
     return list({str(argument).partition("=")[0]: argument for argument in (*first, *later)}.values())
 
 
-def smoke(command: str, *arguments: object) -> Done:
-    """A command of preset smoke that must succeed and be silent on standard error."""
+def smoke(command: str, *arguments: object, noted: str = "") -> Done:
+    """A command of preset smoke that must succeed and be silent on standard error, but for a note."""
     done = playslot(command, *_defaults(arguments), *map(str, arguments), *ONE_CORE)
-    assert (done.code, done.err) == (0, ""), done.err
+    assert done.code == 0, done.err
+    assert noted in done.err, done.err
+    assert noted or not done.err, done.err
     return done
 
 
