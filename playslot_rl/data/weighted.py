@@ -127,6 +127,17 @@ def say_unlike(env: EnvConfig, roots: str) -> None:
                     say_once(f"note: {root.path}: demonstrations of {key}={got or 'off'}, taken for {here or 'off'}")
 
 
+def say_foreign(env: EnvConfig, source: EpisodeFrames, roots: str) -> None:
+    """Say where a set that neither its `robot_type` nor our record knows is taken for recordings of a simulator."""
+    from playslot_rl.envs import RECORDED  # with Gymnasium
+
+    known = ours(source.robot) or any(seen for root in data_roots(roots) for seen in _recorded(root.path))
+    if env.name not in RECORDED and not known:
+        robot = f"robot_type={source.robot}" if source.robot else "no robot_type"
+        said = f"note: {source.name}: got {robot} and no record of ours, taken for recordings of env={env.name}"
+        say_once(f"{said}: a robot's own are read with env={VIDEO}, from the first stage on")
+
+
 def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:
     """One or several data sets as one, by `env.image_size` and what `data` says of cameras, caches, size and stride.
 
@@ -146,12 +157,4 @@ def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path])
         _require_view(config.env, path)
     buffer = data.shuffle_buffer if data.stream else None
     source = open_sources(paths, data.camera, Cache.of(data), image_size=size, resize=data.resize, buffer=buffer)
-    if (
-        config.env.name != VIDEO
-        and not ours(source.robot)
-        and not any(seen for path in paths for seen in _recorded(path))
-    ):
-        robot = f"robot_type={source.robot}" if source.robot else "no robot_type"
-        said = f"note: {source.name}: got {robot} and no record of ours, taken for recordings of env={config.env.name}"
-        say_once(f"{said}: a robot's own are read with env={VIDEO}, from the first stage on")
     return every(source, data.stride, data.stride_action)

@@ -14,6 +14,7 @@ from torch import nn
 
 from playslot_rl.config import StageConfig
 from playslot_rl.data.demonstrations import transitions
+from playslot_rl.data.weighted import say_foreign
 from playslot_rl.modules.action_range import range_of
 from playslot_rl.runtime.processes import here, wait
 from playslot_rl.storage.checkpoints import StageCheckpoint
@@ -108,7 +109,13 @@ def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageChec
     if record.role:
         record.say_unlike()
     with record.training() as begin:
-        return prepare().carry_out(record, begin)
+
+        def begun() -> None:
+            begin()  # where it can be written
+            if record.role:
+                say_foreign(record.config.env, record.data, record.roots)
+
+        return prepare().carry_out(record, begun)
 
 
 def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -> StageCheckpoint:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from robot import robot_actions, write_robot
 
+from playslot_rl.config import EnvConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.data.action_limits import ActionLimits, joined_limits, limits_of, other_units, said, scaled
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.source import labels_of
-from playslot_rl.data.weighted import open_configured
+from playslot_rl.data.weighted import open_configured, say_foreign
 
 
 def joints(rows: int = 400) -> np.ndarray[Any, Any]:
@@ -238,14 +240,18 @@ def test_a_robots_sets_in_two_units_or_taken_for_a_simulators_are_said(
     turned = robot_actions()
     degrees = write_robot(tmp_path / "degrees", turned)
     radians = write_robot(tmp_path / "radians", [np.radians(actions) for actions in turned])
-    own, simulated = compose(["preset=smoke", "env=video"]), compose(["preset=smoke"])
+    own, simulated = compose(["preset=smoke", "env=video"]), EnvConfig()
     capsys.readouterr()  # LeRobot's own
     open_configured(own, [degrees])
     assert not capsys.readouterr().err
     open_configured(own, [degrees, radians])
     assert f"note: {radians}: got shoulder.pos " in (told := capsys.readouterr().err)
     assert "are the units the same?" in told
-    open_configured(simulated, [degrees])
+    source = open_configured(own, [degrees])
+    say_foreign(own.env, source, str(degrees))
+    say_foreign(simulated, replace(source, robot="block_push"), str(degrees))
+    assert not capsys.readouterr().err
+    say_foreign(simulated, source, str(degrees))
     assert (
         "got robot_type=arm and no record of ours, taken for recordings of env=button_press" in capsys.readouterr().err
     )
