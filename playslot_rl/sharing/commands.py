@@ -104,10 +104,9 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any], other: Ex
 
 
 def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any], other: ExperimentConfig | None) -> list[str]:
-    seed, data = source.get("seed"), config.data
+    seed = source.get("seed")
     base, demos = _base(config), f"data.demos={DEMOS}"
-    behaviour = [f"demos={config.demos}"] if config.demos is not None else []
-    behaviour += [f"data.held_out={data.held_out}"] if data.held_out else []
+    behaviour = _kept(config)
     own = [*base, *_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
     if source.get("shipped_world_model"):
         return [_line("train-policy", "run=pretrained", *own, demos, f"out={RUN}")]
@@ -121,12 +120,18 @@ def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any], other:
         own = [*([] if alike else _seeded(seed)), *behaviour]
     among = [demos, *behaviour] if DEMOS in videos.split(",") else []
     if videos == VIDEOS and first.data.root == config.data.demos:  # one set for both: what is held out is of it
-        among = behaviour
+        among = _kept(first)
     return [
         _line("train-slots", *_base(first), *_seeded(world), *settings, *among, f"out={folder}"),
         _line("train-dynamics", f"run={folder}"),
         _line("train-policy", f"run={folder}", *own, demos, f"out={RUN}"),
     ]
+
+
+def _kept(config: ExperimentConfig) -> list[str]:
+    """Which demonstrations are trained on."""
+    held_out = [f"data.held_out={config.data.held_out}"] if config.data.held_out else []
+    return [*([] if config.demos is None else [f"demos={config.demos}"]), *held_out]
 
 
 def _base(config: ExperimentConfig) -> list[str]:
