@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from playslot_rl import keys
 from playslot_rl.data.agreement import say_once
-from playslot_rl.data.metadata import RECORD_NAME, STATS_NAME, json_content
+from playslot_rl.data.metadata import RECORD_NAME, STATS_NAME, json_content, robot_of
 
 if TYPE_CHECKING:
     from playslot_rl.data.contents import Contents
@@ -58,6 +58,12 @@ class ActionLimits:
     def quantiles(self) -> npt.NDArray[np.bool_]:
         """bool (A,), where the ends are q01 and q99, because of outliers."""
         return (self.low > self.smallest) | (self.high < self.largest)
+
+    @property
+    def span(self) -> Floats:
+        """float32 (A,), from end to end."""
+        span: Floats = self.high - self.low
+        return span
 
     def give(self, known: ActionRange) -> None:
         import torch
@@ -119,7 +125,7 @@ def limits_of(files: Contents, actions: Floats | None) -> ActionLimits | None:
 
 def _simulated(files: Contents, actions: Floats) -> bool:
     """Whether a set is of our own simulators: it is named as they are, and has our record or no value beyond 1."""
-    named = ours(str(files.info.get("robot_type") or ""))
+    named = ours(robot_of(files.info))
     return named and ((files.root / RECORD_NAME).is_file() or not (np.abs(actions) > 1).any())
 
 

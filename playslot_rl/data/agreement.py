@@ -16,7 +16,7 @@ import numpy as np
 
 from playslot_rl.config.weights import is_remote
 from playslot_rl.data.contents import Contents, Span, read_contents
-from playslot_rl.data.metadata import EPISODES_PATH, INFO_NAME, NUMBERS, OTHERS, clips_hint
+from playslot_rl.data.metadata import EPISODES_PATH, INFO_NAME, NUMBERS, OTHERS
 from playslot_rl.data.places import CLUTTER, OUTSIDE, SHOWN, Problems, filled, is_clutter, parquet_files
 from playslot_rl.data.tables import MISSING, TASKS_NAME, UNREADABLE, WRONG_COLUMN, Episode
 from playslot_rl.errors import DataError
@@ -221,9 +221,6 @@ def open_files(root: str | Path) -> Contents:
             f"{root}: no such folder, {expected} data set: check the path; `playslot collect` records one, "
             "`playslot dataset pull USER/NAME DIR` downloads one of the Hub"
         )
-    if not (folder / INFO_NAME).is_file():
-        cure = f"check data.root={clips_hint(folder)}"
-        raise DataError(f"data.root={root}: got no {INFO_NAME}, {expected} v3.0 data set: {cure}")
     problems = Problems()
     contents = read_contents(folder, problems, statistics=False)
     unfinished = (

@@ -29,7 +29,9 @@ from playslot_rl.errors import DataError, first_line
 
 ROWS_A_PIECE = 256
 DAMAGED = "damaged frame"
-DARK = 4096  # of 65535: depth in millimetres
+DARK, BRIGHT, LOOKED = 4096, 0.99, 16
+"""Where that share of the pixels is below `DARK` of 65535 in most of the first `LOOKED` 16-bit frames, as in depth in
+millimetres, the upper eight bits are nearly black."""
 FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF")  # Pillow knows more, and starts programs for some
 
 Decoded = Any  # pixels of an image, uint8 (H, W, 3), or (H, W) of a depth map; or PyAV's `VideoFrame`
@@ -53,11 +55,18 @@ def rgb_frames(
     Raises:
         DataError: a frame cannot be decoded, or has another size than stated.
     """
-    problems = Problems()
+    problems, deep = Problems(), list[float]()
     for row, frame in decoded_frames(contents, camera, problems, spans):
         if problems.errors:
             break
+        if len(deep) < LOOKED and getattr(frame, "dtype", None) == np.uint16:
+            deep.append(float(np.quantile(frame, BRIGHT)))
         yield row, to_rgb(frame)
+    if deep and 0 < np.median(deep) < DARK:
+        say_once(
+            f"note: {contents.name}: got pictures of 16 bits below {DARK} from {camera}, of which the upper eight are "
+            "nearly black: scale them (depth to what the robot's work spans), or choose another by data.camera="
+        )
     if problems.errors:
         said = problems.errors[0]
         cure = "" if "the data set" in said else "; the data set is damaged, collect or pull it again"
@@ -71,11 +80,6 @@ def to_rgb(frame: Decoded) -> npt.NDArray[np.uint8]:
     if frame.ndim == 2 and frame.dtype not in (np.uint8, np.uint16):
         raise DataError(f"got a picture of {frame.dtype}, expected colours, or grey of 8 or 16 bits")
     if frame.ndim == 2:
-        if frame.dtype == np.uint16 and 0 < frame.max() < DARK:
-            say_once(
-                f"note: got 16-bit pictures below {DARK} of 65535, of which the upper eight bits are nearly black: "
-                "scale them (depth to what the robot's work spans), or choose another by data.camera="
-            )
         grey = frame if frame.dtype == np.uint8 else (frame >> 8).astype(np.uint8)
         frame = np.repeat(grey[..., None], 3, axis=-1)
     pixels: npt.NDArray[np.uint8] = frame

@@ -127,6 +127,11 @@ def read_info(root: Path) -> dict[str, Any]:
     return checked
 
 
+def robot_of(info: Mapping[str, Any]) -> str:
+    """`robot_type` in one line; empty where there is none."""
+    return " ".join(str(info.get("robot_type") or "").split())
+
+
 def is_depth(feature: Mapping[str, Any]) -> bool:
     """Whether a camera feature is a depth map, whose values are not scaled to [0, 1]."""
     info = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}

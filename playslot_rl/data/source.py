@@ -34,7 +34,7 @@ from playslot_rl.data.cache import (
 )
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.frame_build import FrameArray, build_frames
-from playslot_rl.data.metadata import stated_size
+from playslot_rl.data.metadata import robot_of, stated_size
 from playslot_rl.data.prints import episode_origins, files_fingerprint
 from playslot_rl.data.remote import open_remote
 from playslot_rl.data.stream import FrameStream
@@ -222,7 +222,7 @@ def open_sources(
                     fps=files.fps,
                     task=next(iter(files.episodes[0].tasks), ""),
                     camera=feature,
-                    robot=str(files.info.get("robot_type") or ""),
+                    robot=robot_of(files.info),
                     name=str(root),
                     limits=limits,
                     origins=origins,

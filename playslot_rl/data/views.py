@@ -190,7 +190,7 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
     order, with `weights` of other robots or widths of actions, too; what else is not as in the first is said."""
     first = sources[0]
     met = {(first.fingerprint, first.camera)}
-    for source in sources[1:]:
+    for number, source in enumerate(sources[1:], 1):
         size, expected = ("x".join(map(str, each.image_size)) for each in (source, first))
         facts: list[tuple[str, object, object, str]] = [
             ("frames of", size, expected, ""),
@@ -204,16 +204,13 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
         names, others = (() if each.limits is None else each.limits.names for each in (source, first))
         if sorted(names) == sorted(others):
             facts.append(("actions in the order", ", ".join(names), ", ".join(others), ""))
-        known = [each.limits for each in (source, first) if each.limits is not None]
-        if len(names) == len(others) > 0 and other_units(*(limits.largest - limits.smallest for limits in known)):
-            own, there = (said(limits.plain()) for limits in known)
-            say_once(f"note: {source.name}: got {own}, in {first.name} {there}: are the units the same?")
         for what, got, want, cure in facts:
             unlike = f"{source.name}: got {what} {got}, expected {want} as in {first.name}"
             if got != want and (weights or not cure):
                 raise DataError(f"{unlike}: read sets of one kind")
             if got != want:
                 say_once(f"note: {unlike}: {cure}")
+        _say_units(source, sources[:number])
         if (source.fingerprint, source.camera) in met:
             raise DataError(
                 f"{source.name}: got the frames of {source.camera} twice, expected each recording once: leave one out "
@@ -225,6 +222,19 @@ def agree(sources: Sequence[EpisodeFrames], weights: bool = False) -> None:
             say_once(f"note: {seen}: choose by data.camera=, unless they show the same view")
     for camera in dict.fromkeys(source.camera for source in sources):
         say_shared([(source.name, source.origins) for source in sources if source.camera == camera])
+
+
+def _say_units(source: EpisodeFrames, earlier: Sequence[EpisodeFrames]) -> None:
+    """Say where a set's actions are far wider or narrower than those of the first earlier one of the same robot."""
+    for other in earlier:
+        robots = {source.robot, other.robot} - {""}
+        if source.limits is None or other.limits is None or len(robots) > 1:
+            continue
+        if sorted(source.limits.names) == sorted(other.limits.names):
+            if other_units(source.limits.span, other.limits.span):
+                own, there = (said(each.plain()) for each in (source.limits, other.limits))
+                say_once(f"note: {source.name}: got {own}, in {other.name} {there}: are the units the same?")
+            return
 
 
 def say_shared(sets: Sequence[tuple[str, npt.NDArray[np.str_] | None]]) -> None:

@@ -20,11 +20,11 @@ import numpy.typing as npt
 
 from playslot_rl.config import EnvConfig, ExperimentConfig, metaworld, to_dict
 from playslot_rl.config.env import VIDEO
-from playslot_rl.config.weights import DataRoot, data_roots
+from playslot_rl.config.weights import DataRoot, data_roots, is_remote
 from playslot_rl.data.action_limits import ours
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.cache import Cache
-from playslot_rl.data.metadata import read_record
+from playslot_rl.data.metadata import read_info, read_record, robot_of
 from playslot_rl.data.source import EpisodeFrames, open_sources
 from playslot_rl.data.views import IntArray, concatenate, every, text_hash
 from playslot_rl.errors import DataError
@@ -128,14 +128,17 @@ def say_unlike(env: EnvConfig, roots: str) -> None:
 
 
 def say_foreign(env: EnvConfig, source: EpisodeFrames, roots: str) -> None:
-    """Say where a set that neither its `robot_type` nor our record knows is taken for recordings of a simulator."""
+    """Say which sets that neither their `robot_type` nor our record knows are taken for recordings of a simulator."""
     from playslot_rl.envs import RECORDED  # with Gymnasium
 
-    known = ours(source.robot) or any(seen for root in data_roots(roots) for seen in _recorded(root.path))
-    if env.name not in RECORDED and not known:
-        robot = f"robot_type={source.robot}" if source.robot else "no robot_type"
-        said = f"note: {source.name}: got {robot} and no record of ours, taken for recordings of env={env.name}"
-        say_once(f"{said}: a robot's own are read with env={VIDEO}, from the first stage on")
+    if env.name in RECORDED:
+        return
+    for path, _ in data_roots(roots):
+        robot = source.robot if is_remote(path) else robot_of(read_info(Path(path).expanduser()))
+        if not ours(robot) and not any(_recorded(path)):
+            got = f"robot_type={robot}" if robot else "no robot_type"
+            said = f"note: {path}: got {got} and no record of ours, taken for recordings of env={env.name}"
+            say_once(f"{said}: if they are a robot's own, train its slots, too, with env={VIDEO}")
 
 
 def open_configured(config: ExperimentConfig, roots: str | Sequence[str | Path]) -> EpisodeFrames:

@@ -74,8 +74,8 @@ def valid_starts(
         longest = int(length.max()) if len(length) else 0
         raise DataError(
             f"got episodes of at most {longest} frames ({len(length)} of them), expected at least one of {window}: "
-            "shorten the training window (slots.clip_frames, dynamics.predicted_frames), lower data.stride, or collect "
-            "longer episodes"
+            "shorten the window of its stage (such as slots.clip_frames, dynamics.predicted_frames), lower data.stride "
+            "where it is above 1, or collect longer episodes"
         )
     return first, valid
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from playslot_rl import keys
 from playslot_rl.data.contents import Contents
-from playslot_rl.data.metadata import REQUIRED, read_record
+from playslot_rl.data.metadata import REQUIRED, read_record, robot_of
 from playslot_rl.datasets.verify import require_sound
 
 MEBIBYTE = 2**20
@@ -91,7 +91,7 @@ def info(root: str | Path) -> DatasetSummary:
     return DatasetSummary(
         root=str(root),
         format=str(contents.info["codebase_version"]),
-        robot=" ".join(str(contents.info.get("robot_type") or "").split()),
+        robot=robot_of(contents.info),
         fps=contents.fps,
         episodes=len(lengths),
         frames=contents.rows,

@@ -9,6 +9,7 @@ from typing import Any
 
 from playslot_rl.data.cache import cache_folder
 from playslot_rl.data.contents import Contents
+from playslot_rl.data.metadata import robot_of
 from playslot_rl.data.prints import episode_origins
 from playslot_rl.data.source import labels_of
 from playslot_rl.data.views import say_shared
@@ -64,9 +65,11 @@ def require_same_kind(first: Contents, other: Contents) -> None:
     """Refuse data sets of another rate, robot, features, types or shapes by a DataError."""
     if first.fps != other.fps:
         raise DataError(f"{other.root}: got {other.fps:g} fps, expected {first.fps:g} as in {first.root}; resample one")
-    robots = first.info.get("robot_type"), other.info.get("robot_type")
+    robots = robot_of(first.info), robot_of(other.info)
     if robots[0] != robots[1]:
-        raise DataError(f"{other.root}: got robot_type {robots[1]}, expected {robots[0]} as in {first.root}")
+        raise DataError(
+            f"{other.root}: got robot_type {robots[1] or None}, expected {robots[0] or None} as in {first.root}"
+        )
     names = sorted(set(first.features) ^ set(other.features))
     if names:
         raise DataError(f"{other.root}: got feature {names[0]} in only one of it and {first.root}, expected the same")

@@ -276,7 +276,10 @@ def _require_alike(source: EpisodeFrames, meta: Mapping[str, Any]) -> None:
         raise DataError(f"{source.name}: got actions in the order {got}, expected {expected}, as the policy was taught")
     low, high = (np.asarray(taught[end], np.float32) for end in ("low", "high"))
     actions = source.require_actions(len(low))
-    least, most = np.nanmin(actions, 0), np.nanmax(actions, 0)
+    if source.limits is None:
+        least, most = np.nanmin(actions, 0), np.nanmax(actions, 0)
+    else:  # without the outliers
+        least, most = source.limits.low, source.limits.high
     far = (low < high) & ((least > high) | (most < low) | other_units(high - low, most - least))
     if len(far := np.flatnonzero(far)):
         met = ", ".join(f"{taught['names'][i]} {least[i]:.6g}..{most[i]:.6g}" for i in far)

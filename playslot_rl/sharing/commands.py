@@ -17,6 +17,8 @@ from playslot_rl.config.compose import compose, is_pretrained
 from playslot_rl.config.plain import flatten
 from playslot_rl.config.roles import keys_of
 from playslot_rl.config.weights import data_roots
+from playslot_rl.data.videos import place
+from playslot_rl.data.videos import places as set_places
 from playslot_rl.envs import ENVIRONMENTS, RECORDED, task_config
 from playslot_rl.sharing.folder import SharedPolicyConfig
 
@@ -105,26 +107,24 @@ def _from_nothing(config: ExperimentConfig, source: Mapping[str, Any], other: Ex
 
 def _from_recordings(config: ExperimentConfig, source: Mapping[str, Any], other: ExperimentConfig | None) -> list[str]:
     seed = source.get("seed")
-    base, demos = _base(config), f"data.demos={DEMOS}"
-    behaviour = _kept(config)
+    videos, shown, demos = _named(config, other)
+    base, behaviour, taught = _base(config), _kept(config), f"data.demos={demos}"
     own = [*base, *_seeded(seed), *behaviour, *changes(config, BEHAVIOUR)]
     if source.get("shipped_world_model"):
-        return [_line("train-policy", "run=pretrained", *own, demos, f"out={RUN}")]
-    first, world, videos = other or config, source.get("world_model_seed", seed), _videos(config, other)
+        return [_line("train-policy", "run=pretrained", *own, taught, f"out={RUN}")]
+    first, world = other or config, source.get("world_model_seed", seed)
     settings = [*changes(first, GROUPS), f"data.root={videos}"]
     alike = other is None and world in (None, seed)
     if alike and config.env.name not in RECORDED:
-        return [_line("pipeline", *base, *_seeded(seed), *behaviour, *settings, demos, f"out={RUN}")]
+        return [_line("pipeline", *base, *_seeded(seed), *behaviour, *settings, taught, f"out={RUN}")]
     folder = RUN if alike else WORLD
     if other is None:  # the world model's run says the rest
         own = [*([] if alike else _seeded(seed)), *behaviour]
-    among = [demos, *behaviour] if DEMOS in videos.split(",") else []
-    if videos == VIDEOS and first.data.root == config.data.demos:  # one set for both: what is held out is of it
-        among = _kept(first)
+    among = [f"data.demos={shown}", *_kept(first)] if shown else []
     return [
         _line("train-slots", *_base(first), *_seeded(world), *settings, *among, f"out={folder}"),
         _line("train-dynamics", f"run={folder}"),
-        _line("train-policy", f"run={folder}", *own, demos, f"out={RUN}"),
+        _line("train-policy", f"run={folder}", *own, taught, f"out={RUN}"),
     ]
 
 
@@ -142,15 +142,24 @@ def _seeded(seed: int | None) -> list[str]:
     return [] if seed is None else [f"seed={seed}"]
 
 
-def _videos(config: ExperimentConfig, world: ExperimentConfig | None = None) -> str:
-    """`data.root`, that of the world model's run where it is another one, with names that stand for its folders."""
-    roots, demos = data_roots((world or config).data.root), config.data.demos
-    names = [VIDEOS if len(roots) == 1 else f"{VIDEOS}_{number}" for number in range(1, len(roots) + 1)]
-    named = [
-        root._replace(path=DEMOS if root.path == demos and len(roots) > 1 else name)
-        for root, name in zip(roots, names, strict=True)
-    ]
-    return ",".join(root.text for root in named) or VIDEOS
+def _named(config: ExperimentConfig, other: ExperimentConfig | None = None) -> tuple[str, str, str]:
+    """`data.root` of the world model's run (`other`, where it is another one), its `data.demos` where it held some of
+    its videos out as demonstrations, and `data.demos`; one name for each folder, however the runs wrote it.
+    """
+    first = other or config
+    shown, demos = first.data.demos or first.data.root, config.data.demos or config.data.root
+    if not {*set_places(shown)} & {*set_places(first.data.root)}:
+        shown = ""
+    folders = list(dict.fromkeys([*set_places(demos), *set_places(shown)]))
+    names = {folder: DEMOS if len(folders) == 1 else f"{DEMOS}_{i}" for i, folder in enumerate(folders, 1)}
+    videos = set_places(first.data.root)
+    for number, folder in enumerate(videos, 1):
+        names.setdefault(folder, VIDEOS if len(videos) == 1 else f"{VIDEOS}_{number}")
+    root, seen, taught = (
+        ",".join(one._replace(path=names[place(one.path)]).text for one in data_roots(text))
+        for text in (first.data.root, shown, demos)
+    )
+    return root or VIDEOS, seen, taught or DEMOS
 
 
 def changes(config: ExperimentConfig, groups: tuple[str, ...]) -> list[str]:
@@ -186,10 +195,12 @@ def places(config: ExperimentConfig, source: Mapping[str, Any], world: Experimen
     """What the folders in the commands stand for, a paragraph; empty where the commands make them."""
     if not recorded_elsewhere(config, source):
         return ""
-    adopt = f"; `playslot adopt data.root={VIDEOS} out={RUN}` would choose sizes and steps anew"
-    videos = _videos(config, world).replace(",", "`, `")
+    videos, _, demos = _named(config, world)
+    adopt = f"; `playslot adopt data.root={videos} out={RUN}` would choose sizes and steps anew"
+    names = dict.fromkeys(root.path for root in data_roots(f"{videos},{demos}"))
+    stand = "stands for the data set" if len(names) == 1 else "stand for the data sets"
     return (
-        f"`{videos}` and `{DEMOS}` stand for the data sets, recorded elsewhere, whose "
+        f"{' and '.join(f'`{name}`' for name in names)} {stand}, recorded elsewhere, whose "
         f"fingerprints are above{adopt if config.env.name == 'video' else ''}.\n\n"
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from robot import robot_actions, write_robot
 from playslot_rl.config import EnvConfig
 from playslot_rl.config.compose import compose
 from playslot_rl.data.action_limits import ActionLimits, joined_limits, limits_of, other_units, said, scaled
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.contents import Contents
 from playslot_rl.data.source import labels_of
 from playslot_rl.data.weighted import open_configured, say_foreign
@@ -234,24 +234,48 @@ def test_another_unit_is_one_of_all_that_changes(span: list[float], other: list[
     assert other_units(np.float32(span), np.float32(other)) == unlike
 
 
-def test_a_robots_sets_in_two_units_or_taken_for_a_simulators_are_said(
+def test_a_robots_sets_in_two_units_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    turned = robot_actions()
+    small = [np.radians(actions) for actions in turned]
+    torn = [np.where(np.arange(len(actions))[:, None] == 3, 9e4, actions) for actions in turned]
+    degrees, radians, damaged = (
+        write_robot(tmp_path / name, actions)
+        for name, actions in (("degrees", turned), ("radians", small), ("damaged", [torn[0], *turned[1:]]))
+    )
+    others, seen = write_robot(tmp_path / "others", small, robot="leg"), tmp_path / "seen"
+    write_robot(seen, turned, labelled=False)
+    own = compose(["preset=smoke", "env=video"])
+
+    def told(*roots: Path) -> str:
+        say_once.cache_clear()
+        capsys.readouterr()  # LeRobot's own
+        open_configured(own, roots)
+        return "".join(line for line in capsys.readouterr().err.splitlines() if "units" in line)
+
+    for roots in ((degrees,), (degrees, damaged), (degrees, others)):
+        assert not told(*roots)
+    for roots in ((degrees, radians), (seen, degrees, radians)):
+        assert told(*roots).startswith(f"note: {radians}: got shoulder.pos ")
+        assert f" in {degrees} shoulder.pos " in told(*roots)
+
+
+FOREIGN = (
+    "got robot_type=arm and no record of ours, taken for recordings of env=button_press: if they are a robot's own"
+)
+
+
+def test_a_robots_sets_that_are_taken_for_a_simulators_are_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    turned = robot_actions()
-    degrees = write_robot(tmp_path / "degrees", turned)
-    radians = write_robot(tmp_path / "radians", [np.radians(actions) for actions in turned])
-    own, simulated = compose(["preset=smoke", "env=video"]), EnvConfig()
-    capsys.readouterr()  # LeRobot's own
-    open_configured(own, [degrees])
-    assert not capsys.readouterr().err
-    open_configured(own, [degrees, radians])
-    assert f"note: {radians}: got shoulder.pos " in (told := capsys.readouterr().err)
-    assert "are the units the same?" in told
-    source = open_configured(own, [degrees])
-    say_foreign(own.env, source, str(degrees))
-    say_foreign(simulated, replace(source, robot="block_push"), str(degrees))
-    assert not capsys.readouterr().err
-    say_foreign(simulated, source, str(degrees))
-    assert (
-        "got robot_type=arm and no record of ours, taken for recordings of env=button_press" in capsys.readouterr().err
+    arm, known = (
+        write_robot(tmp_path / "arm", robot="arm\nnote: none"),
+        write_robot(tmp_path / "a", robot="button_press"),
     )
+    source = open_configured(compose(["preset=smoke", "env=video"]), [arm])
+    capsys.readouterr()
+    say_foreign(EnvConfig(name="video"), source, str(arm))
+    say_foreign(EnvConfig(), source, str(known))
+    assert not capsys.readouterr().err
+    say_foreign(EnvConfig(), source, f"{known}:2,{arm}:1")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"note: {arm}: {FOREIGN.replace('=arm', '=arm note: none')}")

@@ -189,7 +189,7 @@ def later_episode(root: Path) -> None:
 
 FAULTS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "gone": ("images", shutil.rmtree, r"no such folder, expected a LeRobot data set"),
-    "an empty folder": ("images", lambda root: (shutil.rmtree(root), root.mkdir()), r"data\.root"),  # type: ignore[dict-item]
+    "an empty folder": ("images", lambda root: (shutil.rmtree(root), root.mkdir()), r"got no meta/info\.json"),  # type: ignore[dict-item]
     "half an info file": ("images", partial(edited_info, text="{"), "damaged"),
     "a list for info": ("images", partial(edited_info, text="[]"), "damaged"),
     "hardly any info": ("images", partial(edited_info, text='{"codebase_version": "v3.0"}'), "damaged"),

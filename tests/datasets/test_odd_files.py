@@ -17,6 +17,7 @@ import pytest
 from damage import CAMERA, ROWS, edit_column, edit_json, truncate
 from PIL import Image
 
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.metadata import read_info
 from playslot_rl.data.source import open_sources
 from playslot_rl.datasets.info import info
@@ -70,12 +71,32 @@ def test_pictures_of_every_kind_are_read_as_what_they_show(name: str, broken: Pa
     assert not [line for line in verify(broken).errors if "decoded" in line]
 
 
-def test_depth_in_millimetres_is_said_to_be_nearly_black(
-    broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+SPARK = DEEP // 64
+SPARK[3, 7] = 65535
+LENS = np.zeros_like(DEEP)
+DARK: dict[str, tuple[list[Pixels], bool]] = {
+    "depth in millimetres": ([DEEP // 64], True),
+    "all of the range": ([DEEP], False),
+    "depth, once with a covered lens": ([DEEP // 64, LENS, DEEP // 64], True),
+    "all of the range, once nearly black": ([DEEP, DEEP // 64, DEEP], False),
+    "depth with a bright pixel": ([SPARK], True),
+    "black": ([LENS], False),
+}
+
+
+@pytest.mark.parametrize("name", DARK)
+def test_what_sixteen_bits_show_nearly_black_is_said(
+    name: str, broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with_picture(broken, encoded(Image.fromarray(DEEP // 64)))
-    assert open_sources(broken, cache=tmp_path / "cache").frames[6].max() < 4
-    assert "note: got 16-bit pictures below 4096 of 65535, " in capsys.readouterr().err
+    say_once.cache_clear()
+    pictures, dark = DARK[name]
+    for number, picture in enumerate(pictures):
+        content = encoded(Image.fromarray(picture))
+        edit_column(broken, ROWS, CAMERA, lambda cells, i=number, c=content: cells[6 + i].update(bytes=c))
+    capsys.readouterr()
+    open_sources(broken, cache=tmp_path / "cache")
+    said = f"note: {broken}: got pictures of 16 bits below 4096 from {CAMERA}, "
+    assert (said in (err := capsys.readouterr().err)) == dark, err
 
 
 def bomb(width: int, height: int) -> bytes:

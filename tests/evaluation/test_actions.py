@@ -106,6 +106,16 @@ def test_another_unit_is_said(
     assert not capsys.readouterr().err
 
 
+def test_a_reading_that_is_none_is_not_taken_for_another_unit(capsys: pytest.CaptureFixture[str]) -> None:
+    """The largest is an outlier, which the set's limits leave out."""
+    low, high, far = np.float32([[0, -70, 5], [40, -50, 5], [9e4, 9e4, 5]])
+    source = recorded([[0, 0]] * 7, [[0, -70, 5], [9e4, 9e4, 5], *[[40, -50, 5]] * 5])
+    _require_alike(
+        replace(source, limits=ActionLimits(("pan", "lift", "grip"), low, high, low, far)), {"actions": TURNED}
+    )
+    assert not capsys.readouterr().err
+
+
 def test_actions_in_another_order_are_refused_and_another_rate_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     ends = np.float32([1, 1, 1])
     source = recorded([[0, 0]] * 7, [[0, -70, 5], *[[40, -50, 5]] * 6])

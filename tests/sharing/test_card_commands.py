@@ -244,11 +244,47 @@ def test_the_commands_are_accepted_and_bring_back_the_config(
     assert "/home/me" not in str(commands)
 
 
-def test_what_is_held_out_of_one_set_for_videos_and_demonstrations_is_held_out_of_slots_too() -> None:
-    config = compose(["preset=smoke", "env=video", "data.root=/home/me/a", "data.demos=/home/me/a", "data.held_out=2"])
-    slots, _, policy = reproduce(config, {"seed": 3}, [])
-    assert "data.held_out=2" in slots.split()
-    assert "data.held_out=2" in policy.split()
+D, V = "data/demonstrations", "data/videos"
+ONE = (f"data.root={D} data.demos={D}", f"data.demos={D}")
+BOTH = (f"data.root={D}_1,{D}_2 data.demos={D}_1,{D}_2", f"data.demos={D}_1,{D}_2")
+SOME = (f"data.root={V}_1,{D} data.demos={D}", f"data.demos={D}")
+HELD: dict[str, tuple[str, str, tuple[str, str]]] = {
+    "one set, named twice": ("/h/a", "/h/a", ONE),
+    "one set, named once": ("/h/a", "", ONE),
+    "one set, written in two ways": ("/h/a", "/h/b/../a/", ONE),
+    "several sets": ("/h/a,/h/b", "/h/a,/h/b", BOTH),
+    "several sets, named once": ("/h/a,/h/b", "", BOTH),
+    "demonstrations among the videos": ("/h/a,/h/b", "/h/b/", SOME),
+    "demonstrations beside the videos": ("/h/a", "/h/b", (f"data.root={V}", f"data.demos={D}")),
+}
+
+
+@pytest.mark.parametrize("kind", HELD)
+def test_demonstrations_that_are_held_out_are_held_out_of_the_videos_too(kind: str) -> None:
+    root, demos, (videos, taught) = HELD[kind]
+    typed = ["preset=smoke", "env=video", f"data.root={root}", f"data.demos={demos}"]
+    config, world = compose([*typed, "data.held_out=2"]), compose([*typed, "data.held_out=3"])
+    for other, kept in ((None, "data.held_out=2"), (world, "data.held_out=3")):
+        slots, _, policy = ({*line.split()} for line in reproduce(config, {"seed": 3}, [], other))
+        assert {*videos.split()} <= slots
+        assert {"data.held_out=2", taught} <= policy
+        assert {word for word in slots if word.startswith("data.held_out=")} == (
+            {kept} if "data.demos" in videos else set()
+        )
+
+
+def test_the_pipeline_of_one_set_names_it_once() -> None:
+    typed = ["preset=smoke", "env=button_press", "data.root=/h/a", "data.demos=/h/a/", "data.held_out=2"]
+    (line,) = reproduce(compose(typed), {"seed": 3, "recorded_elsewhere": True}, [])
+    assert {f"data.root={D}", f"data.demos={D}", "data.held_out=2"} <= {*line.split()}
+
+
+def test_what_the_world_models_run_held_out_of_other_demonstrations_is_named() -> None:
+    config = compose(["preset=smoke", "env=video", "data.root=/h/a", "data.demos=/h/c", "data.held_out=2"])
+    world = compose(["preset=smoke", "env=video", "data.root=/h/a,/h/b", "data.demos=/h/b", "data.held_out=3"])
+    slots, _, policy = (line.split() for line in reproduce(config, {"seed": 3}, [], world))
+    assert {f"data.root={V}_1,{D}_2", f"data.demos={D}_2", "data.held_out=3"} <= {*slots}
+    assert {f"data.demos={D}_1", "data.held_out=2"} <= {*policy}
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ class PlaySlotPolicy(PreTrainedPolicy):
         """Actions (B, A) in [-1, 1] for the frames of the policy's camera, float (B, 3, H, W) in [0, 1]; LeRobot's
         postprocessor gives them in the robot's units. What a policy of several tasks is to do is read of `task`, of
         each environment or of all, at the first frames after a `reset`. A ValueError where there is no such camera or
-        task, for frames of another shape or range, and for another number of environments without a `reset`.
+        task, for frames of another shape, range or kind, and for another number of environments without a `reset`.
         """
         del kwargs
         self.eval()  # as LeRobot's own policies do
