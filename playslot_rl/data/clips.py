@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.device_rows import DeviceRows
 from playslot_rl.data.source import EpisodeFrames
 from playslot_rl.data.stream import ShuffleBuffer, streams_of
@@ -50,6 +51,13 @@ class Clips:
         self.train_episodes, held_out = split_episodes(source.episodes, validation, seed, fits, source.recorded)
         self.validated = "training" if np.isin(held_out, self.train_episodes).any() else "held-out"
         self.held_out = self.spread(held_out)
+
+    def say_short(self) -> None:
+        """Say how many episodes have no window, and are left out."""
+        source, short = self.source, int((self.source.lengths < self.frames).sum())
+        if short:
+            left = f"{short} of {source.episodes} episodes have fewer frames than the window of {self.frames}"
+            say_once(f"note: {source.name}: {left}: nothing is learnt from them")
 
     def pixels(self, rows: IntArray, device: torch.device) -> Tensor:
         """Frames of rows (...), uint8 (..., 3, H, W), on a device."""

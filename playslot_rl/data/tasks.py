@@ -67,6 +67,14 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
         )
 
 
+def say_missing(source: EpisodeFrames, env: EnvConfig) -> None:
+    """Say which of the tasks of `env.task` none of a robot's episodes is of."""
+    recorded = () if source.tasks is None else source.tasks.tolist()
+    if env.name == VIDEO and env.tasks and (missing := {*env.sentences} - {*recorded}):
+        lost = ", ".join(map(repr, sorted(missing)))
+        say_once(f"note: {source.name}: got no episode of {lost}, expected some of each task of env.task={env.task}")
+
+
 def _can_be_typed(said: set[str]) -> bool:
     return all(task.strip() and JOINT not in task for task in said)
 

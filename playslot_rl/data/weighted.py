@@ -133,8 +133,10 @@ def say_foreign(env: EnvConfig, source: EpisodeFrames, roots: str) -> None:
 
     if env.name in RECORDED:
         return
-    for path, _ in data_roots(roots):
-        robot = source.robot if is_remote(path) else robot_of(read_info(Path(path).expanduser()))
+    named = data_roots(roots)
+    for path, _ in named:
+        alone = len(named) == 1 or is_remote(path)
+        robot = source.robot if alone else robot_of(read_info(Path(path).expanduser()))
         if not ours(robot) and not any(_recorded(path)):
             got = f"robot_type={robot}" if robot else "no robot_type"
             said = f"note: {path}: got {got} and no record of ours, taken for recordings of env={env.name}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
@@ -13,7 +14,9 @@ import torch
 from torch import nn
 
 from playslot_rl.config import StageConfig
+from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import transitions
+from playslot_rl.data.tasks import say_missing
 from playslot_rl.data.weighted import say_foreign
 from playslot_rl.modules.action_range import range_of
 from playslot_rl.runtime.processes import here, wait
@@ -114,8 +117,15 @@ def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageChec
             begin()  # where it can be written
             if record.role:
                 say_foreign(record.config.env, record.data, record.roots)
+                say_missing(record.data, record.config.env)
 
         return prepare().carry_out(record, begun)
+
+
+def _ready(begin: Callable[[], None], part: Part) -> None:
+    begin()
+    if isinstance(clips := getattr(part.stage, "clips", None), Clips):
+        clips.say_short()
 
 
 def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -> StageCheckpoint:
@@ -132,8 +142,9 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
             for known in filter(None, map(range_of, part.stage.modules.values())):
                 limits.give(known)
         identity = {**record.resumes(), **training.identity}
+        ready = functools.partial(_ready, begin, part)
         if training.adopt is not None and not part.folder:
-            begin()
+            ready()
             if here().first:
                 own = own_checkpoints(part, record.folder, record.config.seed, identity, record.spec.typed)
                 own.take(training.adopt)
@@ -146,7 +157,7 @@ def _train(record: StageRecord, training: Training, begin: Callable[[], None]) -
             logging=record.config.logging,
             identity=identity,
             typed=record.spec.typed,
-            ready=begin,
+            ready=ready,
         )
         prefix = f"{part.folder}_" if part.folder else ""
         metrics |= {f"{prefix}{key}": value for key, value in state.metrics.items()}

@@ -11,6 +11,7 @@ import pytest
 from foreign import write_foreign
 
 from playslot_rl.config import DataConfig
+from playslot_rl.data.agreement import say_once
 from playslot_rl.data.clips import Clips
 from playslot_rl.data.demonstrations import labelled_rows, split_demonstrations, transitions
 from playslot_rl.data.source import EpisodeFrames, open_sources
@@ -167,3 +168,14 @@ def test_clips_say_whether_they_validate_on_what_is_trained_on(both: EpisodeFram
     )
     said = [Clips(source, 1, share, 0).validated for source, share in ((both, 0.1), (both, 0.0), (alone, 0.5))]
     assert said == ["held-out", "training", "training"]
+
+
+def test_episodes_that_no_clip_fits_in_are_said(both: EpisodeFrames, capsys: pytest.CaptureFixture[str]) -> None:
+    say_once.cache_clear()
+    Clips(both, 1, 0.25, 0).say_short()
+    assert not capsys.readouterr().err
+    Clips(both, 3, 0.25, 0).say_short()
+    assert (
+        capsys.readouterr().err
+        == "note: set: 6 of 16 episodes have fewer frames than the window of 3: nothing is learnt from them\n"
+    )

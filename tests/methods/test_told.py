@@ -23,7 +23,7 @@ from playslot_rl.config.plugins import call
 from playslot_rl.data.action_limits import ActionLimits
 from playslot_rl.data.agreement import say_once
 from playslot_rl.data.demonstrations import Demonstrations, transitions
-from playslot_rl.data.tasks import require_tasks, say_untaught, told_tasks
+from playslot_rl.data.tasks import require_tasks, say_missing, say_untaught, told_tasks
 from playslot_rl.data.views import concatenate, drawn_demonstrations, episode_range
 from playslot_rl.envs import task_config
 from playslot_rl.errors import ConfigError, DataError
@@ -217,7 +217,7 @@ def test_tasks_without_a_label_are_named(capsys: pytest.CaptureFixture[str]) -> 
     assert not capsys.readouterr().err
 
 
-def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
+def test_a_demonstration_is_of_the_task_that_the_set_says(capsys: pytest.CaptureFixture[str]) -> None:
     env = task_config("metaworld/MT10")
     said = np.array([env.sentences[i] for i in (4, 0, 9, 4, 2, 1)])
     source = replace(videos(32), tasks=said)
@@ -241,6 +241,12 @@ def test_a_demonstration_is_of_the_task_that_the_set_says() -> None:
         with pytest.raises(DataError, match=r"got demonstrations of '(nothing|Dance\.)', expected the tasks of"):
             told(replace(source, tasks=tasks))
     robot = replace(source, tasks=np.array(["Open it.", "Close it."] * 3))
+    capsys.readouterr()
+    say_missing(robot, EnvConfig(name="video", task="Open it.+Close it."))
+    say_missing(robot, env)
+    assert not capsys.readouterr().err
+    say_missing(robot, EnvConfig(name="video", task="Open it.+Shut it."))
+    assert "got no episode of 'Shut it.', expected some of each task of env.task=" in capsys.readouterr().err
     with pytest.raises(
         DataError, match=r"of 'Close it\.', expected .* leave its episodes out; none are of 'close it\.'"
     ):

@@ -61,12 +61,13 @@ def instead(first: Sequence[object], *later: object) -> list[object]:
     return list({str(argument).partition("=")[0]: argument for argument in (*first, *later)}.values())
 
 
-def smoke(command: str, *arguments: object, noted: str = "") -> Done:
-    """A command of preset smoke that must succeed and be silent on standard error, but for a note."""
+def smoke(command: str, *arguments: object, noted: Sequence[str] = ()) -> Done:
+    """A command of preset smoke that must succeed and be silent on standard error, but for these notes, a line each."""
     done = playslot(command, *_defaults(arguments), *map(str, arguments), *ONE_CORE)
     assert done.code == 0, done.err
     lines = done.err.splitlines()
-    assert (len(lines), noted in done.err) == (int(bool(noted)), True), done.err
+    assert len(lines) == len(noted), done.err
+    assert all(note in line for note, line in zip(noted, lines, strict=True)), done.err
     return done
 
 
