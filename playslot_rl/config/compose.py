@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import yaml
 
-from playslot_rl.config import ExperimentConfig, from_dict, metaworld, plugins, to_dict
+from playslot_rl.config import CompareConfig, ExperimentConfig, from_dict, metaworld, plugins, to_dict
 from playslot_rl.config.arguments import require_digits, require_folders, require_once, require_plain
 from playslot_rl.config.baselines import known_methods
 from playslot_rl.config.env import VIDEO
@@ -309,6 +309,8 @@ def _with_task(
     env = merged(merged(values["env"], fitted), typed.get("env", {}))
     own = preset_values(env, values["preset"], values["dynamics"]["predicted_frames"], plugins.brought(TASKS_GROUP))
     width = {"env": {"action_dim": fitted["action_dim"]}} if fitted else {}
+    if typed.get("compare", {}).get("videos"):  # instead of the numbers of the preset
+        own = {**own, "compare": {**own.get("compare", {}), "demos": CompareConfig.demos}}
     return merged(merged(merged(values, width), own), typed)
 
 

@@ -21,7 +21,8 @@ from playslot_rl.config.stage_spec import BASELINES, StageSpec
 from playslot_rl.errors import ConfigError
 
 GROUPS: Final = ("model", "slots", "dynamics", "behaviour", BASELINES.rstrip("."))
-DEMOS: Final = ("demos", "data.draw", "compare.demos")
+DRAW: Final = "data.draw"
+DEMOS: Final = ("demos", DRAW, "compare.demos")
 """What says which demonstrations there are to learn from."""
 LABELLED: Final = "behaviour.labelled_demos"
 LABELS: Final = "compare.labels"
@@ -51,7 +52,8 @@ class Chosen:
     def reads(self, key: str) -> bool:
         """Whether one of the methods reads a key, by its dotted name; true of keys that are not the methods' affair."""
         if key in DEMOS:
-            return any(stage.data in ("demos", "labelled") for stage in self.stages)
+            learn = any(stage.data in ("demos", "labelled") for stage in self.stages)
+            return learn and (key, self.command) != (DRAW, "compare")
         if key == LABELS:
             return any(method.some_labelled or method.labelled_only for method in self.methods)
         if key == LABELLED and self.command == "compare" and self.config.compare.labels:
@@ -67,11 +69,16 @@ class Chosen:
         if key == LABELLED and self.reads("demos"):
             labels = self.command == "compare" and self.reads(LABELS)
             return f"expected {'labels' if labels else 'demos'}=, how many demonstrations with actions are learned from"
+        if key == DRAW and self.command == "compare":
+            return "expected seeds=, each of which draws its own demonstrations"
         own = key.removeprefix(BASELINES).split(".")
         for first in range(1, len(own)):
             alike = [one for one in self._keys if one.endswith("." + ".".join(own[first:]))]
             if 0 < len(alike) <= MOST:
                 return f"expected {' or '.join(f'{one}=' for one in alike)}"
+        of_world = any(_within(key, stage_named(name).reads) for name in WORLD)
+        if of_world and any(method.slots for method in self.methods):
+            return "expected none with run=, whose world model is there: train one with it, or leave run= out"
         return "expected none: leave it out"
 
     @property
@@ -105,7 +112,9 @@ def chosen(config: ExperimentConfig, command: str) -> Chosen | None:
         world = tuple(name for name in WORLD if name in method.last.parents)
         return Chosen(command, config, (method,), _stages(method), tuple(map(stage_named, world)))
     if command == "compare":
-        methods, world = tuple(METHODS[name] for name in config.compare.methods), WORLD
+        methods, own = tuple(METHODS[name] for name in config.compare.methods), config.compare
+        named = [part for part in (config.run, *own.runs.split(",")) if part.strip()]
+        world = () if len(named) >= own.worlds else WORLD  # nothing of it is trained here
         stages = tuple(stage for method in methods for stage in _stages(method))
     elif command == "compare-video":
         methods, world = tuple(map(method_of, config.compare_video.methods)), WORLD[:1]

@@ -19,6 +19,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import re
 from collections.abc import Callable, Sequence
 from statistics import NormalDist
 from typing import Final
@@ -33,6 +34,8 @@ DRAWS: Final = 2000
 """B."""
 RATE: Final = (0.0, 1.0)
 """Bounds of a success rate."""
+APART: Final = (-1.0, 1.0)
+"""Those of a difference."""
 _TAILS: Final = (0.025, 0.975)
 
 
@@ -67,6 +70,24 @@ def rate_text(rate: float, ci95: Sequence[float], note: str = "", unit: str = " 
     """
     low, high = (100 * end for end in ci95)
     return f"{100 * rate:.0f}{unit} ({low:.0f} to {high:.0f}{note})"
+
+
+def points_text(difference: float, ci95: Sequence[float]) -> str:
+    """A difference of rates in points and its interval, bold where that leaves out 0.
+
+    Example:
+        >>> points_text(0.35, [0.28, 0.42]), points_text(-0.01, [-0.2, 0.004])
+        ('**+35 (+28 to +42)**', '−1 (−20 to 0)')
+    """
+    low, high = ci95
+    return in_bold([f"{round(100 * number):+d}" for number in (difference, *ci95)], low > 0 or high < 0)
+
+
+def in_bold(numbers: Sequence[str], bold: bool) -> str:
+    """`+3.1 (0 to 6.2)` of a value and the ends of its interval."""
+    value, low, high = numbers
+    text = re.sub(r"[+-]0(?![.\d])", "0", f"{value} ({low} to {high})").replace("-", "−")
+    return f"**{text}**" if bold else text
 
 
 def newcombe(both: float, first: float, second: float, pairs: int) -> Interval:
@@ -146,13 +167,17 @@ def of_differences(outcomes: Outcomes, reference: Outcomes) -> Interval:
     """95 % interval of a difference of success rates on pairs: the bootstrap's, or Newcombe's of as many pairs as there
     are episodes where that is wider, as where few of them differ.
     """
-    apart = paired(outcomes, reference)
-    there = ~np.isnan(apart)
-    pairs, both = int(there.any(axis=(0, 1)).sum()), outcomes * reference
+    alone, (low, high) = newcombe(*_pairs(outcomes, reference)), hierarchical(paired(outcomes, reference), APART)
+    return min(low, alone[0]), max(high, alone[1])
+
+
+def _pairs(outcomes: Outcomes, reference: Outcomes) -> tuple[float, float, float, int]:
+    """Episodes that both won, or one of them alone, as means over the policies; and how many episodes there are."""
+    there, both = ~np.isnan(paired(outcomes, reference)), outcomes * reference
+    pairs = int(there.any(axis=(0, 1)).sum())
     parts = (np.where(there, part, np.nan) for part in (both, outcomes - both, reference - both))
     won, first, second = (float(np.nanmean(part)) * pairs for part in parts)
-    alone, (low, high) = newcombe(won, first, second, pairs), hierarchical(apart, (-1.0, 1.0))
-    return min(low, alone[0]), max(high, alone[1])
+    return won, first, second, pairs
 
 
 def paired(outcomes: Outcomes, reference: Outcomes) -> Outcomes:
@@ -210,6 +235,23 @@ def over_tasks(tasks: Sequence[Outcomes], seed: int = 0) -> tuple[float, Interva
     alone = wilson(min(score, 1.0) * trials, trials)
     low, high = _widened(score, middle, _widening(tasks), RATE)
     return score, (min(low, alone[0]), max(high, alone[1]))
+
+
+def apart_over_tasks(tasks: Sequence[tuple[Outcomes, Outcomes]]) -> tuple[float, Interval]:
+    """Mean over tasks of the difference of a row's success rate and a reference's on pairs, and its 95 % interval: that
+    of draws within each task, widened as `hierarchical`'s, at least Newcombe's of all episodes. Tasks weigh the same.
+    """
+    drawn, apart = list[npt.NDArray[np.float64]](), [paired(*sides) for sides in tasks]
+    for number, outcomes in enumerate(apart):
+        counts = [_counts(units, 3 * number + level) for level, units in enumerate(outcomes.shape)]
+        there = ~np.isnan(outcomes)
+        sums, whole = _sums(counts, np.where(there, outcomes, 0.0)), _sums(counts, there.astype(np.float64))
+        drawn.append(sums / np.where(whole > 0, whole, np.nan))
+    means, value = np.mean(drawn, axis=0), float(np.mean([weighted_mean(one) for one in apart]))
+    low, high = _widened(value, means[~np.isnan(means)], _widening(apart), APART)
+    won, first, second, pairs = (sum(part) for part in zip(*(_pairs(*sides) for sides in tasks), strict=True))
+    alone = newcombe(won, first, second, int(pairs))
+    return value, (min(low, alone[0]), max(high, alone[1]))
 
 
 @functools.lru_cache(maxsize=32)

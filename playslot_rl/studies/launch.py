@@ -94,6 +94,11 @@ def open_comparison(out: Path) -> None:
         raise OutputError(f"out={out}: got a folder that holds something else, expected none: choose another out=")
 
 
+def of_tasks(out: Path) -> bool:
+    """Whether a folder holds comparisons of several tasks, a folder each."""
+    return any(out.glob(f"*/{LOCK}"))
+
+
 def job_command(job_file: Path) -> list[str]:
     return [sys.executable, "-m", JOB_MODULE, str(job_file)]
 

@@ -83,7 +83,7 @@ def test_no_other_command_has_a_choice() -> None:
     [
         "methods=slot_oracle,playslot demos=20 behaviour.labelled_demos=10",
         "methods=playslot slots.steps=3 dynamics.steps=3 model.savi.token_dim=8",
-        "methods=slot_bc labels=5 run=pretrained slots.steps=3 model.savi.n_slots=3",
+        "methods=slot_bc labels=5 slots.steps=3 model.savi.n_slots=3",
         "methods=resnet_bc,slot_oracle labels=5",
     ],
 )

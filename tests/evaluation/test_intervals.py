@@ -8,6 +8,7 @@ import pytest
 from playslot_rl.evaluation.intervals import (
     RATE,
     Outcomes,
+    apart_over_tasks,
     hierarchical,
     interquartile_mean,
     newcombe,
@@ -16,6 +17,7 @@ from playslot_rl.evaluation.intervals import (
     over_tasks,
     paired,
     resampled,
+    weighted_mean,
     wilson,
 )
 
@@ -208,6 +210,21 @@ def test_two_seeds_widen_the_interval_over_tasks_as_that_of_one_task() -> None:
     alone = of_successes(apart)
     assert over_tasks([apart])[1] == pytest.approx(alone, abs=0.1)
     assert alone[1] - alone[0] > 0.5
+
+
+def test_the_difference_over_tasks_is_that_of_one_where_there_is_one() -> None:
+    draws = np.random.default_rng(0)
+    first, second = ((draws.random((3, 5, 20)) < chance).astype(np.float64) for chance in (0.8, 0.5))
+    second[0, 1] = np.nan  # a run that is missing
+    value, interval = apart_over_tasks([(first, second)])
+    assert value == pytest.approx(weighted_mean(paired(first, second)))
+    assert interval == pytest.approx(of_differences(first, second))
+    both, narrower = apart_over_tasks([(first, second), (second, first)])
+    assert both == pytest.approx(0, abs=1e-12), "tasks weigh the same"
+    assert narrower[0] < 0 < narrower[1]
+    even = np.ones((1, 2, 10))
+    low, high = apart_over_tasks([(even, even)] * 3)[1]
+    assert -0.2 < low < 0 < high < 0.2, "as Newcombe's of thirty pairs that are alike"
 
 
 @pytest.mark.slow

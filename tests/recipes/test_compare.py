@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import ONE_CORE, Done, assert_one_line, contents, instead, playslot
+from commands import ONE_CORE, Done, assert_one_line, contents, instead, playslot, refused
 
 from playslot_rl.config.compare import LAUNCHERS
+from playslot_rl.config.compose import compose
+from playslot_rl.errors import ConfigError
 from playslot_rl.studies.launch import comparison_lock
 
 pytestmark = pytest.mark.integration
@@ -146,12 +148,64 @@ def test_two_world_models_on_a_test_block_drawn_once(shared_run: Path, tmp_path:
     assert _result(out)["block"] == test
 
 
-def test_a_changed_setting_is_not_mixed_with_old_results(shared_run: Path, tmp_path: Path, started: list[str]) -> None:
+CHANGED: dict[str, tuple[str, str]] = {
+    "a setting": (
+        "behaviour.steps=7",
+        "steps: got 7, expected 6, with which slot_oracle-d2-s0 of .* was trained",
+    ),
+    "what is held out": ("data.held_out=1", "data.held_out: got 1, expected 0, with which slot_oracle-d2-s0 of"),
+    "the world model": (
+        "run=pretrained",
+        "run: got pretrained/button_press with .*, expected a world model with",
+    ),
+    "none": ("run=", "run: got .*world_model with none yet, expected a world model with slots .* use another out="),
+}
+
+
+def test_a_changed_setting_is_refused_before_anything_is_written(
+    shared_run: Path, tmp_path: Path, started: list[str]
+) -> None:
     command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
     assert playslot(*command).code == 0
-    done = playslot(*command, "behaviour.steps=7")
-    assert done.code == 1
-    assert "steps: got 7, expected 6" in _result(tmp_path / "out")["rows"][0]["error"]
+    before = contents(tmp_path / "out")
+    for changed, message in CHANGED.values():
+        refused(*command, changed, message=message)
+        assert contents(tmp_path / "out") == before
+    assert len(started) == 1
+
+
+def test_a_comparison_of_one_task_is_not_written_over_that_of_several(shared_run: Path, tmp_path: Path) -> None:
+    (tmp_path / "out" / "button_press").mkdir(parents=True)
+    for folder in (tmp_path / "out", tmp_path / "out" / "button_press"):
+        (folder / "comparison.lock").touch()
+    command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
+    refused(*command, message="got comparisons of several tasks, by envs=, expected none: choose another")
+
+
+@pytest.mark.parametrize(
+    ("typed", "message"),
+    [
+        (
+            "data.draw=3",
+            "data.draw: got 3 with methods=.*, expected seeds=, each of which draws its own",
+        ),
+        ("model.savi.n_slots=5", "model.savi.n_slots: got 5 with .*, expected none with run=, whose world model is"),
+        (
+            "slots.clip_frames=3",
+            "slots.clip_frames: got 3 with methods=.*, expected none with run=, whose world",
+        ),
+    ],
+)
+def test_what_no_job_reads_is_refused(typed: str, message: str, shared_run: Path, tmp_path: Path) -> None:
+    command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
+    refused(*command, typed, message=message, code=2)
+
+
+def test_videos_stand_instead_of_the_presets_demonstrations() -> None:
+    typed = ["preset=smoke", "methods=playslot", "labels=2", "videos=3"]
+    assert compose(typed, "compare").compare.numbers == (5,)
+    with pytest.raises(ConfigError, match="expected none with videos="):
+        compose([*typed, "demos=4"], "compare")
 
 
 def test_what_decides_an_evaluation_is_measured_again_when_it_changes(

@@ -12,8 +12,10 @@ from jobs_on_disk import comparison
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.actions import Errors, scores
 from playslot_rl.studies.success.errors import summarise_errors
+from playslot_rl.studies.success.figure import success_figure
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.summary import differences
+from playslot_rl.visualization.charts import LIGHT
 from playslot_rl.visualization.document import to_markdown
 
 ACTIONS = np.array([10.0, 30.0, 20.0, 20.0])
@@ -35,7 +37,7 @@ def rows(method: str, errors: Any) -> list[dict[str, Any]]:
             "references": {"constant": values, "previous": values},
             "per_episode": {"rows": ACTIONS.tolist(), "mae": own.tolist(), "rmse": own.tolist()},
             "agent_steps": None, "env_steps": None, "samples": None, "parameters": None, "pretraining": None,
-            "train_seconds": 1.0, "evaluation_seconds": 1.0,
+            "train_seconds": 1.0, "evaluation_seconds": 1.0, "curve": None,
         })  # fmt: skip
     return found
 
@@ -74,6 +76,22 @@ def test_a_seed_that_one_of_them_lacks_makes_no_pair() -> None:
     [found] = differences([*rows("playslot", CLONED), *rows("lapo", [CLONED[0] - 2])], "playslot")
     assert found["seeds"] == [0]
     assert found["difference"] == pytest.approx(-2.0)
+
+
+def test_what_is_of_fewer_seeds_says_so(tmp_path: Path) -> None:
+    jobs = [*rows("playslot", CLONED), *rows("lapo", CLONED)]
+    jobs[2]["references"] = {name: {"mae": 9.0, "rmse": 9.0, "r2": 0.0} for name in ("constant", "previous")}
+    measured = ("mae", "rmse", "r2", "references", "per_episode")
+    jobs[3] = {key: value for key, value in jobs[3].items() if key not in measured} | {"status": "waiting"}
+    result = {**comparison(tmp_path, []), "rows": jobs, "summary": summarise_errors(jobs), "labels": [2], "episodes": 4}
+    result |= {"measure": "actions", "held_out": 4, "differences": differences(jobs, "playslot")}
+    page = to_markdown(success_page(result))
+    cells = [line.split("|")[2].strip() for line in page.splitlines() if line.startswith(("| LAPO |", "| (action"))]
+    assert cells[0].endswith("; 1 of 2 seeds")
+    assert cells[1].startswith("3.22"), "of the method that has most seeds"
+    assert cells[2].endswith("(of 1 seed)")
+    (axes,) = success_figure(result, LIGHT).axes
+    assert {"mean labelled action", "action of the step before"} <= {line.get_label() for line in axes.lines}
 
 
 def test_the_page_says_which_side_is_better(tmp_path: Path) -> None:

@@ -12,16 +12,19 @@ from jobs_on_disk import comparison, finish
 
 from playslot_rl.config import ExperimentConfig
 from playslot_rl.config.compose import compose, compose_each
+from playslot_rl.config.methods import METHODS
 from playslot_rl.errors import ConfigError, PlaySlotError
 from playslot_rl.recipes import compare
 from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.launch import comparison_lock, read_status
 from playslot_rl.studies.success import tasks
+from playslot_rl.studies.success.figure import tasks_figure
 from playslot_rl.studies.success.jobs import SuccessJob, success_jobs
 from playslot_rl.studies.success.measure import SuccessMeasure, check_success, job_rows
 from playslot_rl.studies.success.page import success_page
-from playslot_rl.studies.success.summary import summarise
+from playslot_rl.studies.success.summary import differences, summarise
 from playslot_rl.studies.success.task_table import joint_table, tasks_page
+from playslot_rl.visualization.charts import LIGHT
 from playslot_rl.visualization.document import to_markdown
 
 TWO = "envs=metaworld/door-open,block_push_easy"
@@ -139,6 +142,43 @@ def test_the_page_of_tasks_shows_them(results: list[dict[str, Any]], tmp_path: P
     said = "PlaySlot is ahead of all methods on the labels alone in 1 of 2 tasks, by intervals that leave out 0 in 1;"
     assert f"{said} not in hard." in table
     assert "| hard | – |" in page.partition("## Over tasks\n")[2], "the oracle was not measured there"
+
+
+def test_the_mean_difference_over_tasks_is_shown_on_pairs(results: list[dict[str, Any]]) -> None:
+    joint = joint_table(results, "playslot")
+    (row,) = joint["differences"]
+    assert (row["method"], row["labels"], row["difference"]) == ("slot_bc", 5, pytest.approx(-0.25))  # -50 and 0 points
+    low, high = row["ci95"]
+    assert low < row["difference"] < high
+    page = to_markdown(success_page({**results[0], "across_tasks": joint}))
+    table = page.partition("## Over tasks, with 5 labelled demonstrations")[2].partition("## ")[0]
+    assert re.search(r"\| less PlaySlot, points \| – \| \**−25 \(", table)
+    assert "Of 20 demonstrations, the most there are, where not of labels alone." in table
+    lost = [results[0], lacking(results[1], "slot_bc-d5-l5-s1")]
+    assert joint_table(lost, "playslot")["differences"] == [], "not of all runs"
+
+
+def test_a_reference_on_labels_alone_is_not_held_against_itself(results: list[dict[str, Any]]) -> None:
+    lost = {"outcomes": "0" * 10, "success_rate": 0.0, "successes": 0}
+    own = [row for row in results[0]["rows"] if row["method"] == "slot_bc"]
+    others = [{**row, **lost, "method": "resnet_bc", "name": row["name"].replace("slot", "resnet")} for row in own]
+    rows = [*results[0]["rows"], *others]
+    result = {**results[0], "rows": rows, "summary": summarise(rows), "differences": differences(rows, "slot_bc")}
+    assert joint_table([result], "slot_bc")["ahead"] == [
+        {"labels": 5, "ahead": ["easy"], "surely": ["easy"], "behind": []}
+    ]
+
+
+def test_the_picture_of_tasks_is_of_as_many_demonstrations_as_their_table(tmp_path: Path) -> None:
+    found = [finish(SuccessJob("playslot", n, 0, tmp_path, 5), {"simulation": n // 5}) for n in (20, 40)]
+    rows = [row for job in found for row in job_rows(job, 5, read_status(job.file)) if row["protocol"] == "simulation"]
+    result = {**comparison(tmp_path, rows), "env": "easy", "labels": [5]}
+    (cell,) = joint_table([result], "playslot")["cells"]
+    (axes,) = tasks_figure({"easy": result}, LIGHT).axes
+    assert (axes.get_title(), cell["success_rate"]) == ("easy\n40 videos", 0.8)
+    assert [list(line.get_ydata()) for line in axes.lines if line.get_marker() == METHODS["playslot"].style.marker] == [
+        [80]
+    ]
 
 
 def test_a_task_without_success_is_said_to_be_measured_by_return(results: list[dict[str, Any]]) -> None:

@@ -13,6 +13,9 @@ from playslot_rl.studies.success.summary import CELL, cells, finished, outcomes_
 ERRORS: Final = ("mae", "rmse", "r2", "references", "per_episode")
 """What a job's row has of its `eval_info.json`."""
 
+TITLES: Final = {"constant": "(mean labelled action)", "previous": "(action of the step before)"}
+"""Of what every policy is held against."""
+
 
 def summarise_errors(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One row a cell, as `summarise`: `mae`, `rmse` and `r2` are means over its runs, so are those of `references`, and
@@ -44,10 +47,10 @@ def _means(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
 
 def error_references(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of a table for what every policy is held against: at each number of labels the same for all methods."""
-    titles = {"constant": "(mean labelled action)", "previous": "(action of the step before)"}
-    at = {row["at"]: row for row in rows if "mae" in row and row["at"] is not None}
+    known = sorted((row for row in rows if "mae" in row and row["at"] is not None), key=lambda row: row["runs"])
+    at = {row["at"]: row for row in known}  # of most runs, for their labels are drawn anew
     return [
         {"title": title, "protocol": "actions", "at": number, **row["references"][name]}
-        for name, title in titles.items()
+        for name, title in TITLES.items()
         for number, row in at.items()
     ]

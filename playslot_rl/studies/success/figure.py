@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from playslot_rl.config.methods import METHODS
 from playslot_rl.studies.study import Result
+from playslot_rl.studies.success.errors import TITLES, error_references
 from playslot_rl.studies.success.page import Panel, budgeted, panels
 from playslot_rl.visualization.charts import Theme, legend, new_figure, panel_grid, step_axis, style_axes
 
+REFERENCES = dict(zip(TITLES.values(), (":", "--"), strict=True))
 AXES = {"demos": "demonstrations", "labels": "labelled demonstrations", "videos": "unlabelled videos of demonstrations"}
 
 if TYPE_CHECKING:
@@ -43,11 +45,11 @@ def success_figure(result: Result, theme: Theme) -> Figure:
 
 
 def tasks_figure(results: Mapping[str, Result], theme: Theme) -> Figure:
-    """The first panel of the figure of every task that learns from demonstrations."""
-    shown = {task: found[0] for task, result in results.items() if (found := panels(result))}
+    """The last panel, of the most demonstrations, of every task's figure; none of tasks that learn from none."""
+    shown = {task: found[-1] for task, result in results.items() if (found := panels(result))}
     figure, places = panel_grid(max(1, len(shown)), 4.2, 3.2)
     for axes, (task, panel) in zip(places, shown.items(), strict=False):
-        axes.set_title(task, color=theme.text, fontsize=10)
+        axes.set_title("\n".join(filter(None, (task, panel.title))), color=theme.text, fontsize=10)
         _against(axes, panel, theme)
         _finish(axes, results[task], theme)
     legend(figure, theme, loc="outside lower center", ncols=3, fontsize=9)
@@ -83,6 +85,10 @@ def _against(axes: Axes, panel: Panel, theme: Theme) -> None:
         if len({(row["world"], row["seed"]) for row in single}) > 1:
             dots = [row["at"] * aside for row in single]
             axes.plot(dots, [scale * row[key] for row in single], ".", color=colour, markersize=4, alpha=0.5)
+    for title, line in REFERENCES.items() if key == "mae" else ():
+        own = sorted((row for row in error_references(panel.rows) if row["title"] == title), key=lambda row: row["at"])
+        x, y = [row["at"] for row in own], [row[key] for row in own]
+        axes.plot(x, y, color=theme.series[7], linestyle=line, linewidth=1.2, marker="|", label=title.strip("()"))
     if numbers and numbers[0] == 0:
         axes.set_xscale("symlog", linthresh=min(numbers[1:], default=1))
     else:

@@ -236,7 +236,10 @@ def check_data(config: ExperimentConfig) -> ExperimentConfig:
     config = _recorded_elsewhere(config) if config.env.name in RECORDED else config
     if uses_demos(config) and (config.data.demos or _recorded(out)):
         where = config.data.demos or str(out / EXPERT)
-        check_demos(config, _episodes(where), f"data.demos={where}")
+        if config.data.demos:
+            check_demos(config, _episodes(where), f"data.demos={where}")
+        else:
+            check_demos(config, _episodes(where), where, "use another out=, for which as many are recorded")
         open_videos(config, where, "compare").require_actions(config.env.action_dim)
     held_out_seeds(config, config.compare.evaluation_seed, config.episodes or 0, out)
     return config
@@ -263,12 +266,12 @@ def _recorded_elsewhere(config: ExperimentConfig) -> ExperimentConfig:
     return config
 
 
-def check_demos(config: ExperimentConfig, episodes: int, where: str) -> None:
+def check_demos(config: ExperimentConfig, episodes: int, where: str, cure: str = "collect more") -> None:
     """Refuse more demonstrations than there are, by a ConfigError."""
     most = config.compare.numbers[-1]
     if most > episodes:
         raise ConfigError(
-            f"demos: got {most}, expected at most the {episodes} demonstrations of {where}: lower it or collect more"
+            f"demos: got {most}, expected at most the {episodes} demonstrations of {where}: lower it or {cure}"
         )
 
 
@@ -281,7 +284,7 @@ def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
     if (world or any(METHODS[name].model for name in config.compare.methods)) and not config.data.root:
         config = replace(config, data=collect_videos(config, out))
     if uses_slots(config):
-        runs = [_world(config, out, number) for number in range(config.compare.worlds)]
+        runs = [_world(config, number) for number in range(config.compare.worlds)]
         config = replace(config, run=runs[0], compare=replace(config.compare, runs=",".join(runs[1:])))
     for method in models.values():
         stage = shared_model(config, method)
@@ -291,12 +294,17 @@ def prepare_shared(config: ExperimentConfig) -> ExperimentConfig:
     return config
 
 
-def _world(config: ExperimentConfig, out: Path, number: int) -> str:
-    """Run of a world model, which is trained where none is named."""
+def world_run(config: ExperimentConfig, number: int) -> str:
+    """Run of a world model: a named one, else `OUT/world_model`, then `OUT/world_model_1`."""
     named = [part for part in world_runs(config) if part]
-    if number < len(named):
-        return named[number]
-    model = str(numbered(out / "world_model", number))
+    return named[number] if number < len(named) else str(numbered(Path(config.out) / "world_model", number))
+
+
+def _world(config: ExperimentConfig, number: int) -> str:
+    """Run of a world model, which is trained where none is named."""
+    model = world_run(config, number)
+    if model in world_runs(config):
+        return model
     for stage in world_parts(config.compare.methods):
         train(f"train-{stage}", replace(config, out=model, run="", seed=config.seed + number))
     return model

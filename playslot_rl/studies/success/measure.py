@@ -11,7 +11,7 @@ from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS, require_told
 from playslot_rl.envs import RECORDED, check_task
-from playslot_rl.errors import CheckpointError, ConfigError
+from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 from playslot_rl.evaluation.actions import error_text, require_offline
 from playslot_rl.evaluation.before import measured_before
 from playslot_rl.evaluation.held_out import held_out_seeds
@@ -20,6 +20,8 @@ from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing
 from playslot_rl.storage.checkpoints import require_config
+from playslot_rl.storage.resume import first_difference
+from playslot_rl.studies import launch
 from playslot_rl.studies.launch import Status, train
 from playslot_rl.studies.study import Evaluate, Record, count_parameters, made_by
 from playslot_rl.studies.success.block import block_of, with_block
@@ -38,11 +40,13 @@ from playslot_rl.studies.success.jobs import (
     uses_demos,
     uses_slots,
     world_parts,
+    world_run,
     world_runs,
 )
 from playslot_rl.studies.success.page import success_page
 from playslot_rl.studies.success.summary import differences, summarise
 from playslot_rl.studies.success.task_table import joint_table
+from playslot_rl.training.record import StageRecord
 
 
 def job_rows(job: SuccessJob, frame_skip: int, status: Status) -> list[dict[str, Any]]:
@@ -138,8 +142,11 @@ class SuccessMeasure:
         self._references, self._shared = dict[str, Any](), dict[str, Any]()
 
     def check(self) -> None:
+        if launch.of_tasks(out := Path(self.config.out)):
+            raise OutputError(f"out={out}: got comparisons of several tasks, by envs=, expected none: choose another")
         check_success(self.config)
         self.config = check_data(self.config)
+        require_same_trainings(self.config)
 
     def prepare(self) -> Mapping[SuccessJob, Record]:
         self.config = config = prepare_shared(with_block(self.config))
@@ -250,6 +257,50 @@ def check_success(config: ExperimentConfig) -> None:
                     f"run={run}: got a world model of {' '.join(trained.typed)}, expected {' '.join(env.typed)}: "
                     "leave it out to train one"
                 )
+
+
+def require_same_trainings(config: ExperimentConfig) -> None:
+    """Refuse settings, or a world model, with which trainings of this folder were not begun, by a ConfigError: each job
+    would, one after the other, and what is there would be lost from the result.
+    """
+    for job in success_jobs(config, Path(config.out)):
+        begun, folder = json_or_nothing(job.file).get("config"), job.run / job.stage
+        if not begun or not any((folder / name).is_dir() for name in ("checkpoint", "checkpoints")):
+            continue
+        found = _other_settings(config, job, begun) or _other_world(config, job)
+        if found is not None:
+            key, known, got = found
+            raise ConfigError(
+                f"{key}: got {got}, expected {known}, with which {job.name} of {config.out} was trained: "
+                f"leave {key} as it was, or use another out="
+            )
+
+
+def _other_settings(config: ExperimentConfig, job: SuccessJob, begun: Any) -> tuple[str, Any, Any] | None:
+    """The first setting that is not as a job was begun with: its key, as it was and as it is."""
+    try:
+        before = from_dict(ExperimentConfig, begun)
+    except ValueError:  # of an earlier version: the job itself says what is unlike
+        return None
+    if before.data.held_out != config.data.held_out:  # which data there are to learn from
+        return "data.held_out", before.data.held_out, config.data.held_out
+    spec = METHODS[job.method].last
+    old, own = (StageRecord(spec, job.run, one).finishes() for one in (before, success_config(config, job, "")))
+    return first_difference(old, own, spec.typed)
+
+
+def _other_world(config: ExperimentConfig, job: SuccessJob) -> tuple[str, str, str] | None:
+    """`run`, where a finished job built on another world model: that one, and the one of now."""
+    parents = json_or_nothing(job.run / job.stage / "checkpoint" / "meta.json").get("parents", {})
+    run = world_run(config, job.world)
+    for name in METHODS[job.method].world if parents else ():
+        try:
+            own = Run.open(run).stage(name).fingerprint
+        except CheckpointError:  # it is to be trained
+            own = "none yet"
+        if parents.get(name, own) != own:
+            return "run", f"a world model with {name} {parents[name]}", f"{run} with {own}"
+    return None
 
 
 def check_recorded(config: ExperimentConfig) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from playslot_rl.config.methods import METHODS, stage_named
 from playslot_rl.evaluation.actions import error_text
-from playslot_rl.evaluation.intervals import rate_text
+from playslot_rl.evaluation.intervals import in_bold, points_text, rate_text
 from playslot_rl.runtime.progress import format_seconds
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note, open_jobs_notes, origin_notes
 from playslot_rl.studies.success.errors import error_references
@@ -36,12 +35,11 @@ def success_page(result: Result) -> Document:
     if result.get("measure") == "actions":
         return _errors_page(result)
     worlds, block = result["worlds"], result["block"]
-    levels = "world models, seeds and episodes" if worlds > 1 else "seeds and episodes, of one world model"
     lead = (
         f"Preset `{result['preset']}`, world models {worlds}, training seeds {_list(result['seeds'])}, "
         f"{result['episodes']} held-out episodes, the same for all, at most {result['max_steps']} agent steps. "
         f"{_block(block)} Success is the mean over the trained policies; in brackets its 95 % bootstrap interval over "
-        f"{levels}, and the lowest and the highest policy."
+        f"{_levels(result)}, and the lowest and the highest policy."
     )
     sections = [
         *(_section(panel, result) for panel in panels(result)),
@@ -62,13 +60,19 @@ def _errors_page(result: Result) -> Document:
         f"Preset `{result['preset']}`, world models {result['worlds']}, training seeds {_list(result['seeds'])}. "
         f"Without a simulator each policy acts at the frames of the last {result['held_out']} demonstrations, the same "
         "for all, which nothing was trained on. The error is the mean absolute one over the dimensions, in the data "
-        "set's units; in brackets its 95 % bootstrap interval over seeds and episodes. R2 is 0 for the mean labelled "
+        f"set's units; in brackets its 95 % bootstrap interval over {_levels(result)}. R2 is 0 for the mean labelled "
         "action, 1 for no error. It is no success: a small error may still fail, and another action may succeed."
     )
     sections = [_section(panel, result) for panel in panels(result)]
     sections += [Section(FOOTNOTES, [Notes(_footnotes(result))]), Section("Every job", [_jobs(result["rows"])])]
     title = f"{result['env']}: error of actions on held-out demonstrations"
     return Document(title, lead, sections, [Linked("Error of actions", "comparison.png")])
+
+
+def _levels(result: Result) -> str:
+    """What intervals are over."""
+    several = result["worlds"] > 1
+    return "world models, seeds and episodes" if several else "seeds and episodes, of one world model"
 
 
 def _block(block: Result) -> str:
@@ -152,7 +156,7 @@ def _section(panel: Panel, result: Result) -> Section:
         caption = (
             f"{what}, on pairs of the same world model, seed and episode; bold where the 95 % interval leaves out 0."
         )
-        table = _table(panel.differences, panel.axis, [_apart(row, errors) for row in panel.differences])
+        table = _table(panel.differences, panel.axis, [_apart(row, result) for row in panel.differences])
         blocks.append(Table([f"less {title}", *table.headers[1:]], table.rows, caption))
     return Section(panel.heading, blocks)
 
@@ -167,12 +171,24 @@ def _table(rows: Sequence[Result], axis: str, texts: Sequence[str]) -> Table:
     return Table([what, *(f"{n:,} {UNITS[axis]}" for n in numbers)], body)
 
 
-def _apart(row: Result, errors: bool) -> str:
-    """`+35 (28 to 42)`, in points of success or in units of the error, bold where 0 is left out."""
-    numbers = [row["difference"], *row["ci95"]]
-    value, low, high = (f"{number:+.3g}" if errors else f"{round(100 * number):+d}" for number in numbers)
-    text = re.sub(r"[+-]0(?![.\d])", "0", f"{value} ({low} to {high})").replace("-", "−")
-    return f"**{text}**" if row["leaves_out_0"] else text
+def _apart(row: Result, result: Result) -> str:
+    """`+35 (28 to 42)`, in points of success or in units of the error, bold where 0 is left out; and of how many seeds,
+    if not all."""
+    own = (
+        f" (of {len(row['seeds'])} seed{'s' * (len(row['seeds']) > 1)})"
+        if len(row["seeds"]) < _seeds(row, result)
+        else ""
+    )
+    if result.get("measure") != "actions":
+        return points_text(row["difference"], row["ci95"]) + own
+    return in_bold([f"{number:+.3g}" for number in (row["difference"], *row["ci95"])], row["leaves_out_0"]) + own
+
+
+def _seeds(row: Result, result: Result) -> int:
+    """How many a method and the reference have in common, finished or not."""
+    both = (row["method"], result["reference"])
+    mine, theirs = ({job["seed"] for job in result["rows"] if job["method"] == method} for method in both)
+    return len(mine & theirs)
 
 
 def _by_acting(result: Result) -> list[Section]:
@@ -193,15 +209,17 @@ def budgeted(row: Result, result: Result) -> str:
 
 def cell(row: Result, result: Result) -> str:
     """Rate, interval and range: `97 % (93 to 99; seeds 96 to 98)`; and how many policies there are, if not all."""
-    if "mae" in row:
+    if "runs" not in row:  # what policies are held against
         return error_text(row)
     what, note = "policies" if len(row["worlds"]) > 1 else "seeds", ""
-    if row["runs"] > 1:
+    if row["runs"] > 1 and "mae" not in row:
         note = f"; {what} {100 * row['lowest']:.0f} to {100 * row['highest']:.0f}"
     own = [job for job in result["rows"] if all(job[key] == row[key] for key in ("method", "demos", "labels"))]
     wanted = len({job["name"] for job in own})
     if row["runs"] < wanted:
         note += f"; {row['runs']} of {wanted} {what}"
+    if "mae" in row:
+        return error_text(row) + note
     return rate_text(row["success_rate"], row["ci95"], note)
 
 

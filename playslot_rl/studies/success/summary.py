@@ -14,6 +14,7 @@ import numpy as np
 from playslot_rl.config.methods import METHODS
 from playslot_rl.evaluation.intervals import (
     Outcomes,
+    apart_over_tasks,
     hierarchical,
     of_differences,
     of_successes,
@@ -103,12 +104,10 @@ def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
         for cell, runs in known.items():
             if cell[:2] == other[:2] or not (at := _pair(cell, other)):
                 continue
-            several = min(len(worlds[cell[0]]), len(worlds[reference])) > 1
-            sides = _in_both(runs, there, ("world", "seed") if several else ("seed",))
-            if not sides[0]:
+            seeds, tables = _met(runs, there, min(len(worlds[cell[0]]), len(worlds[reference])) > 1)
+            if not seeds:
                 continue
-            seeds = sorted({run["seed"] for run in sides[0]})
-            tables, of_errors = [outcomes_of(side, seeds) for side in sides], "mae" in there[0]
+            of_errors = "mae" in there[0]
             apart, actions = paired(*tables), there[0]["per_episode"]["rows"] if of_errors else 1.0
             low, high = hierarchical(apart, weights=actions) if of_errors else of_differences(*tables)
             clear = low > 0 or high < 0
@@ -135,6 +134,15 @@ def _pair(cell: tuple[Any, ...], reference: tuple[Any, ...]) -> tuple[Any, Any] 
     return (cell if alone[1] else reference)[2], labels[0] if labels else None
 
 
+def _met(runs: Sequence[Row], reference: Sequence[Row], several: bool) -> tuple[list[int], tuple[Outcomes, Outcomes]]:
+    """The seeds that both sides have, and the outcomes of each, paired by world models where both have `several`."""
+    sides = _in_both(runs, reference, ("world", "seed") if several else ("seed",))
+    seeds = sorted({run["seed"] for run in sides[0]})
+    if not seeds:
+        return [], (np.zeros((0, 0, 0)), np.zeros((0, 0, 0)))
+    return seeds, (outcomes_of(sides[0], seeds), outcomes_of(sides[1], seeds))
+
+
 def _in_both(runs: Sequence[Row], reference: Sequence[Row], keys: Sequence[str]) -> tuple[list[Row], list[Row]]:
     """The runs of two cells that have one like them in the other."""
     first, second = ({tuple(run[key] for key in keys) for run in side} for side in (runs, reference))
@@ -151,7 +159,7 @@ def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     rows = []
     for key in tasks[0] if tasks else ():
         runs = [task.get(key, []) for task in tasks]
-        if not all(side and len(finished(side)) == len(side) for side in runs):
+        if not all(map(_all_done, runs)):
             continue
         outcomes = [outcomes_of(side, sorted({run["seed"] for run in side})) for side in runs]
         if any(np.isnan(one).any() for one in outcomes):
@@ -160,6 +168,31 @@ def across_tasks(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         values = dict(zip(("method", "protocol", "labels"), key, strict=True))
         rows.append(values | {"title": runs[0][0]["title"], "score": score, "ci95": list(interval)})
     return rows
+
+
+def apart_across_tasks(results: Sequence[Mapping[str, Any]], reference: str | None) -> list[dict[str, Any]]:
+    """Success in simulation less that of the reference method, `difference` and `ci95`, the mean over tasks, of methods
+    that have all runs of all tasks, and as many labels."""
+    tasks, found = [largest(result["rows"]) for result in results], list[dict[str, Any]]()
+    whole = [key for key in (tasks[0] if tasks else ()) if all(_all_done(task.get(key)) for task in tasks)]
+    whole = [key for key in whole if key[1] == "simulation"]
+    for first in (key for key in whole if key[0] == reference):
+        for key in whole:
+            if key == first or key[2] != first[2]:
+                continue
+            sides = []
+            for task in tasks:
+                several = min(len({run["world"] for run in task[side]}) for side in (key, first)) > 1
+                sides.append(_met(task[key], task[first], several))
+            if all(seeds for seeds, _ in sides):
+                value, interval = apart_over_tasks([tables for _, tables in sides])
+                names = dict(zip(("method", "protocol", "labels"), key, strict=True))
+                found.append({**names, "title": tasks[0][key][0]["title"], "difference": value, "ci95": list(interval)})
+    return found
+
+
+def _all_done(runs: Sequence[Row] | None) -> bool:
+    return bool(runs) and len(finished(runs or ())) == len(runs or ())
 
 
 def largest(rows: Sequence[Row]) -> dict[tuple[Any, ...], list[Row]]:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from playslot_rl.config.methods import METHODS
-from playslot_rl.evaluation.intervals import rate_text
+from playslot_rl.evaluation.intervals import points_text, rate_text
 from playslot_rl.studies.study import FOOTNOTES, Result, machine_note
-from playslot_rl.studies.success.summary import CELL, across_tasks, largest
+from playslot_rl.studies.success.summary import CELL, across_tasks, apart_across_tasks, largest
 from playslot_rl.visualization.document import Block, Document, Linked, Notes, Section, Table, Text
 
 IQM = "interquartile mean"
@@ -16,10 +16,10 @@ IQM = "interquartile mean"
 
 def joint_table(results: Sequence[Result], reference: str | None) -> dict[str, Any]:
     """`tasks`; `summary`, every task's with its `env`; `cells`, of these the ones of the largest number of
-    demonstrations, with `runs` that are done, `of` all; `rows`, the interquartile means over tasks; and `ahead`, of
-    each number of labels the tasks in which the reference in simulation beats every method on these labels alone,
-    those in which it does by intervals of the paired differences (`surely`), and those in which it does not, of tasks
-    that have all runs.
+    demonstrations, with `runs` that are done, `of` all; `rows`, the interquartile means over tasks; `differences`, the
+    means over tasks of those to the reference; and `ahead`, of each number of labels the tasks in which the reference
+    in simulation beats every method on these labels alone, those in which it does by intervals of the paired
+    differences (`surely`), and those in which it does not, of tasks that have all runs.
     """
     cells = [cell for result in results for cell in _cells(result)]
     return {
@@ -28,6 +28,7 @@ def joint_table(results: Sequence[Result], reference: str | None) -> dict[str, A
         "summary": [{"env": result["env"], **row} for result in results for row in result["summary"]],
         "cells": cells,
         "reference": reference,
+        "differences": apart_across_tasks(results, reference),
         "ahead": _ahead(results, cells, reference),
     }
 
@@ -55,7 +56,7 @@ def _ahead(results: Sequence[Result], cells: Sequence[Result], reference: str | 
             task = result["env"]
             own = [cell for cell in cells if (cell["env"], cell["labels"]) == (task, labels)]
             first = [cell for cell in own if (cell["method"], cell["protocol"]) == (reference, "simulation")]
-            alone = [cell for cell in own if METHODS[cell["method"]].labelled_only]
+            alone = [cell for cell in own if METHODS[cell["method"]].labelled_only and cell["method"] != reference]
             if first and alone and all(map(_whole, [*first, *alone])):
                 rate, *others = (round(cell["success_rate"], 9) for cell in [*first, *alone])  # means round differently
                 sides["ahead" if rate > max(others) else "behind"].append(task)
@@ -99,7 +100,14 @@ def _blocks(joint: Result, labels: int | None) -> list[Block]:
     titles = [METHODS[name].title + ("" if at == "simulation" else f", {at}") for name, at in methods]
     missing = any(cell["runs"] < cell["of"] for cell in own)
     caption = "In brackets 95 % intervals."
+    if videos := sorted({cell["demos"] for cell in own if not METHODS[cell["method"]].labelled_only} - {None}):
+        caption += f" Of {' or '.join(map(str, videos))} demonstrations, the most there are, where not of labels alone."
     caption += " A mean is of methods that have all runs of all tasks." if missing else ""
+    apart = {(row["method"], row["protocol"]): row for row in joint["differences"] if row["labels"] == labels}
+    if apart:
+        caption += " Differences are means over tasks, on pairs of the same world model, seed and episode."
+        texts = [points_text(row["difference"], row["ci95"]) if (row := apart.get(m)) else "–" for m in methods]
+        body.append([f"less {METHODS[joint['reference']].title}, points", *texts])
     blocks: list[Block] = [Table(["success, %", *titles], body, caption)]
     for sides in (sides for sides in joint["ahead"] if sides["labels"] == labels):
         where = f"; not in {', '.join(sides['behind'])}" if sides["behind"] else ""
