@@ -29,7 +29,7 @@ from playslot_rl.config.method_keys import read_alone, require_read
 from playslot_rl.config.methods import canonical_method
 from playslot_rl.config.plain import flatten, merged, multiplied, nearest, put, type_hints
 from playslot_rl.config.planning import GOALS, PLANNERS, PROPOSALS
-from playslot_rl.config.roles import keys_of
+from playslot_rl.config.roles import declared, keys_of
 from playslot_rl.config.spelling import quoted, typed_value
 from playslot_rl.config.tasks import GROUP as TASKS_GROUP
 from playslot_rl.config.tasks import TASKS
@@ -228,13 +228,16 @@ def hint_of(key: str) -> Any:
 
 
 def _unknown_key(key: str) -> str:
-    """The message for an unknown key: the keys of its deepest known group, and the nearest key of all."""
+    """The message for an unknown key: the keys of its deepest known group, and the nearest key of all, or those of
+    that name in some group."""
     group = key.rpartition(".")[0]
     while group and not dataclasses.is_dataclass(hint_of(group)):
         group = group.rpartition(".")[0]
     level = hint_of(group) if group else ExperimentConfig
     names = [f"{group}.{f.name}" if group else f.name for f in dataclasses.fields(level)]
-    hint = nearest(key, [*names, *flatten(to_dict(ExperimentConfig()))])
+    known = [*flatten(to_dict(ExperimentConfig())), *declared(ExperimentConfig, "unsaid")]
+    alike = [name for name in known if name.endswith(f".{key}")]
+    hint = f"; did you mean {' or '.join(alike)}?" if 0 < len(alike) <= 3 else nearest(key, [*names, *known])
     return f"unknown key {key}: expected one of {', '.join(sorted(names))}{hint}"
 
 

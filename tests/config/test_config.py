@@ -177,6 +177,7 @@ def test_a_folder_in_the_home_folder_may_be_written_with_a_tilde(monkeypatch: py
         ("sed=1", "unknown key sed: expected one of .*did you mean seed"),
         ("slots.lr=1", "unknown key slots.lr: expected one of .*slots.optim"),
         ("slots.optm.lr=1", "did you mean slots.optim.lr"),
+        ("reference=slot_bc", "did you mean compare.reference?"),
         ("seed=x", "seed: got 'x' .*expected int"),
         ("seed=-1", "seed: got -1, expected a non-negative integer"),
         ("env.image_size=50", "env.image_size: got 50, expected 32, 64 or 128"),
