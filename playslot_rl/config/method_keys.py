@@ -62,7 +62,8 @@ class Chosen:
             return True
         beside = f"{key.rpartition('.')[0]}.steps"  # whoever trains for so many steps looks as often as is said there
         named = beside if key in keys_of(ExperimentConfig, "free") else key
-        return any(_within(one, stage.reads) for one in (key, named) for stage in (*self.stages, *self.world))
+        own = [self._read_by(stage) for stage in self.stages] + [stage.reads for stage in self.world]
+        return any(_within(one, names) for one in (key, named) for names in own)
 
     def instead(self, key: str) -> str:
         """What to type, as the end of a message."""
@@ -71,14 +72,14 @@ class Chosen:
             return f"expected {'labels' if labels else 'demos'}=, how many demonstrations with actions are learned from"
         if key == DRAW and self.command == "compare":
             return "expected seeds=, each of which draws its own demonstrations"
+        of_world = any(_within(key, stage_named(name).reads) for name in WORLD)
+        if self.command == "compare" and of_world and any(method.slots for method in self.methods):
+            return "expected none with run=, whose world model is there: train one with it, or leave run= out"
         own = key.removeprefix(BASELINES).split(".")
         for first in range(1, len(own)):
             alike = [one for one in self._keys if one.endswith("." + ".".join(own[first:]))]
             if 0 < len(alike) <= MOST:
                 return f"expected {' or '.join(f'{one}=' for one in alike)}"
-        of_world = any(_within(key, stage_named(name).reads) for name in WORLD)
-        if of_world and any(method.slots for method in self.methods):
-            return "expected none with run=, whose world model is there: train one with it, or leave run= out"
         return "expected none: leave it out"
 
     @property
@@ -88,6 +89,11 @@ class Chosen:
             return f"method={self.config.method}, which does not read it"
         names = self.config.compare.methods if self.command == "compare" else self.config.compare_video.methods
         return f"methods={','.join(names)}, which {'do' if len(names) > 1 else 'does'} not read it"
+
+    def _read_by(self, stage: StageSpec) -> tuple[str, ...]:
+        """What a method's stage reads; of a world model that is named, what it must share says the world model."""
+        named = self.command == "compare" and not self.world
+        return (*stage.keys, *stage.settings, *stage.also) if named else stage.reads
 
     @cached_property
     def _own(self) -> tuple[str, ...]:

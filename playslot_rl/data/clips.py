@@ -57,7 +57,7 @@ class Clips:
         source, short = self.source, int((self.source.lengths < self.frames).sum())
         if short:
             left = f"{short} of {source.episodes} episodes have fewer frames than the window of {self.frames}"
-            say_once(f"note: {source.name}: {left}: nothing is learnt from them")
+            say_once(f"note: {source.name}: {left}: they are left out")
 
     def pixels(self, rows: IntArray, device: torch.device) -> Tensor:
         """Frames of rows (...), uint8 (..., 3, H, W), on a device."""

@@ -67,12 +67,15 @@ def require_tasks(source: EpisodeFrames, env: EnvConfig) -> None:
         )
 
 
-def say_missing(source: EpisodeFrames, env: EnvConfig) -> None:
-    """Say which of the tasks of `env.task` none of a robot's episodes is of."""
-    recorded = () if source.tasks is None else source.tasks.tolist()
-    if env.name == VIDEO and env.tasks and (missing := {*env.sentences} - {*recorded}):
-        lost = ", ".join(map(repr, sorted(missing)))
-        say_once(f"note: {source.name}: got no episode of {lost}, expected some of each task of env.task={env.task}")
+def say_missing(source: EpisodeFrames, env: EnvConfig, videos: bool) -> None:
+    """Say which of the tasks of `env.task` none of a robot's episodes is of; of `videos`, which need not be of all,
+    where some are of another task: one of them may be misspelt."""
+    recorded = set() if source.tasks is None else {*source.tasks.tolist()} - {""}
+    missing, others = {*env.sentences} - recorded, recorded - {*env.sentences}
+    if env.name == VIDEO and env.tasks and missing and (others or not videos):
+        lost, there = (", ".join(map(repr, sorted(tasks)[:3])) for tasks in (missing, others))
+        but = f", but some of {there}" if others else ""
+        say_once(f"note: {source.name}: got no episode of {lost}{but}: is env.task={env.task} as meant?")
 
 
 def _can_be_typed(said: set[str]) -> bool:

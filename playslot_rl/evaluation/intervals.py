@@ -243,14 +243,17 @@ def apart_over_tasks(tasks: Sequence[tuple[Outcomes, Outcomes]]) -> tuple[float,
     """
     drawn, apart = list[npt.NDArray[np.float64]](), [paired(*sides) for sides in tasks]
     for number, outcomes in enumerate(apart):
-        counts = [_counts(units, 3 * number + level) for level, units in enumerate(outcomes.shape)]
+        draws = [_counts(units, 3 * number + level) for level, units in enumerate(outcomes.shape)]
         there = ~np.isnan(outcomes)
-        sums, whole = _sums(counts, np.where(there, outcomes, 0.0)), _sums(counts, there.astype(np.float64))
+        sums, whole = _sums(draws, np.where(there, outcomes, 0.0)), _sums(draws, there.astype(np.float64))
         drawn.append(sums / np.where(whole > 0, whole, np.nan))
     means, value = np.mean(drawn, axis=0), float(np.mean([weighted_mean(one) for one in apart]))
     low, high = _widened(value, means[~np.isnan(means)], _widening(apart), APART)
-    won, first, second, pairs = (sum(part) for part in zip(*(_pairs(*sides) for sides in tasks), strict=True))
-    alone = newcombe(won, first, second, int(pairs))
+    counts = [_pairs(*sides) for sides in tasks]
+    pairs = sum(of for *_, of in counts)
+    shares = [[pairs / len(tasks) * part / of for part in parts] for *parts, of in counts]  # as if all had as many
+    won, first, second = (sum(part) for part in zip(*shares, strict=True))
+    alone = newcombe(won, first, second, pairs)
     return value, (min(low, alone[0]), max(high, alone[1]))
 
 

@@ -196,12 +196,13 @@ def places(config: ExperimentConfig, source: Mapping[str, Any], world: Experimen
     if not recorded_elsewhere(config, source):
         return ""
     videos, _, demos = _named(config, world)
-    adopt = f"; `playslot adopt data.root={videos} out={RUN}` would choose sizes and steps anew"
+    alone = config.env.name == "video" and len(data_roots(videos)) == 1  # it takes one set
+    adopt = f"; `playslot adopt data.root={videos} out={RUN}` would choose sizes and steps anew" if alone else ""
     names = dict.fromkeys(root.path for root in data_roots(f"{videos},{demos}"))
     stand = "stands for the data set" if len(names) == 1 else "stand for the data sets"
     return (
         f"{' and '.join(f'`{name}`' for name in names)} {stand}, recorded elsewhere, whose "
-        f"fingerprints are above{adopt if config.env.name == 'video' else ''}.\n\n"
+        f"fingerprints are above{adopt}.\n\n"
     )
 
 

@@ -95,8 +95,8 @@ def open_comparison(out: Path) -> None:
 
 
 def of_tasks(out: Path) -> bool:
-    """Whether a folder holds comparisons of several tasks, a folder each."""
-    return any(out.glob(f"*/{LOCK}"))
+    """Whether a folder holds a comparison of several tasks, each in a folder of its own; one of one task has jobs."""
+    return (out / LOCK).is_file() and not (out / "jobs").is_dir() and any(out.glob(f"*/{LOCK}"))
 
 
 def job_command(job_file: Path) -> list[str]:

@@ -117,7 +117,7 @@ def run_stage(record: StageRecord, prepare: Callable[[], Prepared]) -> StageChec
             begin()  # where it can be written
             if record.role:
                 say_foreign(record.config.env, record.data, record.roots)
-                say_missing(record.data, record.config.env)
+                say_missing(record.videos, record.config.env, record.role == "train")
 
         return prepare().carry_out(record, begun)
 

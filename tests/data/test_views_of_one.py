@@ -177,5 +177,5 @@ def test_episodes_that_no_clip_fits_in_are_said(both: EpisodeFrames, capsys: pyt
     Clips(both, 3, 0.25, 0).say_short()
     assert (
         capsys.readouterr().err
-        == "note: set: 6 of 16 episodes have fewer frames than the window of 3: nothing is learnt from them\n"
+        == "note: set: 6 of 16 episodes have fewer frames than the window of 3: they are left out\n"
     )

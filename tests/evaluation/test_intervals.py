@@ -223,6 +223,9 @@ def test_the_difference_over_tasks_is_that_of_one_where_there_is_one() -> None:
     assert both == pytest.approx(0, abs=1e-12), "tasks weigh the same"
     assert narrower[0] < 0 < narrower[1]
     even = np.ones((1, 2, 10))
+    few = np.ones((1, 1, 5))
+    value, (low, high) = apart_over_tasks([(np.ones((1, 1, 50)), np.ones((1, 1, 50))), (few, 0 * few)])
+    assert low < value == 0.5 < high, "however many episodes a task has"
     low, high = apart_over_tasks([(even, even)] * 3)[1]
     assert -0.2 < low < 0 < high < 0.2, "as Newcombe's of thirty pairs that are alike"
 

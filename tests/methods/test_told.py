@@ -242,11 +242,16 @@ def test_a_demonstration_is_of_the_task_that_the_set_says(capsys: pytest.Capture
             told(replace(source, tasks=tasks))
     robot = replace(source, tasks=np.array(["Open it.", "Close it."] * 3))
     capsys.readouterr()
-    say_missing(robot, EnvConfig(name="video", task="Open it.+Close it."))
-    say_missing(robot, env)
+    three = EnvConfig(name="video", task="Open it.+Close it.+Lift it.")
+    for unlabelled in (True, False):
+        say_missing(robot, EnvConfig(name="video", task="Open it.+Close it."), unlabelled)
+        say_missing(robot, env, unlabelled)
+    say_missing(robot, three, videos=True)
     assert not capsys.readouterr().err
-    say_missing(robot, EnvConfig(name="video", task="Open it.+Shut it."))
-    assert "got no episode of 'Shut it.', expected some of each task of env.task=" in capsys.readouterr().err
+    say_missing(robot, three, videos=False)
+    assert "got no episode of 'Lift it.': is env.task=Open it.+Close it.+Lift it. as meant?" in capsys.readouterr().err
+    say_missing(robot, EnvConfig(name="video", task="Open it.+Shut it."), videos=True)
+    assert "got no episode of 'Shut it.', but some of 'Close it.': is env.task=" in capsys.readouterr().err
     with pytest.raises(
         DataError, match=r"of 'Close it\.', expected .* leave its episodes out; none are of 'close it\.'"
     ):

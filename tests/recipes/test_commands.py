@@ -224,7 +224,7 @@ def test_a_foreign_data_set_trains_slots_and_dynamics(foreign: Path, tmp_path: P
     say_once.cache_clear()
     taken = "taken for recordings of env=button_press: if they are a robot's own"
     smoke("train-slots", f"out={run}", *arguments, noted=[taken])
-    short = "1 of 3 episodes have fewer frames than the window of 4: nothing is learnt from them"
+    short = "1 of 3 episodes have fewer frames than the window of 4: they are left out"
     smoke("train-dynamics", f"run={run}", noted=[short])  # the other once
     assert contents(foreign) == before
     refused("train-policy", f"run={run}", message="actions of width 2, expected 4 as in env.action_dim")

@@ -18,6 +18,7 @@ from commands import ONE_CORE, Done, assert_one_line, contents, instead, playslo
 from playslot_rl.config.compare import LAUNCHERS
 from playslot_rl.config.compose import compose
 from playslot_rl.errors import ConfigError
+from playslot_rl.storage.atomic import write_json
 from playslot_rl.studies.launch import comparison_lock
 
 pytestmark = pytest.mark.integration
@@ -153,6 +154,10 @@ CHANGED: dict[str, tuple[str, str]] = {
         "behaviour.steps=7",
         "steps: got 7, expected 6, with which slot_oracle-d2-s0 of .* was trained",
     ),
+    "a size": (
+        "model.policy.mlp_dim=24",
+        "model.policy.mlp_dim: got 24, expected .*, with which slot_oracle-d2-s0",
+    ),
     "what is held out": ("data.held_out=1", "data.held_out: got 1, expected 0, with which slot_oracle-d2-s0 of"),
     "the world model": (
         "run=pretrained",
@@ -171,7 +176,19 @@ def test_a_changed_setting_is_refused_before_anything_is_written(
     for changed, message in CHANGED.values():
         refused(*command, changed, message=message)
         assert contents(tmp_path / "out") == before
+    (file,) = (tmp_path / "out" / "jobs").glob("*-s0.json")  # as a version before left it that tried another setting
+    write_json(file, {**(job := json.loads(file.read_text())), "config": {**job["config"], "behaviour": {"steps": 7}}})
+    refused(*command, "behaviour.steps=7", message="steps: got 7, expected 6")
+    assert playslot(*command).code == 0
     assert len(started) == 1
+
+
+def test_the_same_command_carries_on_where_it_recorded_the_demonstrations(tmp_path: Path, started: list[str]) -> None:
+    command = ["compare", "preset=smoke", "env=button_press", "run=pretrained", "methods=slot_bc", "demos=2",
+               "labels=1", "seeds=0", f"out={tmp_path / 'out'}", "episodes=1", *ONE_CORE]  # fmt: skip
+    for more, jobs in ((), 1), ((), 1), (("seeds=0,1",), 2):
+        assert playslot(*map(str, instead(command, *more))).code == 0
+        assert len(started) == jobs
 
 
 def test_a_comparison_of_one_task_is_not_written_over_that_of_several(shared_run: Path, tmp_path: Path) -> None:
@@ -197,8 +214,9 @@ def test_a_comparison_of_one_task_is_not_written_over_that_of_several(shared_run
     ],
 )
 def test_what_no_job_reads_is_refused(typed: str, message: str, shared_run: Path, tmp_path: Path) -> None:
-    command = _arguments(shared_run, tmp_path / "out", "methods=slot_oracle", "demos=2")
-    refused(*command, typed, message=message, code=2)
+    for methods in ("slot_oracle", "playslot"):
+        command = _arguments(shared_run, tmp_path / "out", f"methods={methods}", "demos=2")
+        refused(*command, typed, message=message, code=2)
 
 
 def test_videos_stand_instead_of_the_presets_demonstrations() -> None:

@@ -45,7 +45,7 @@ def success_figure(result: Result, theme: Theme) -> Figure:
 
 
 def tasks_figure(results: Mapping[str, Result], theme: Theme) -> Figure:
-    """The last panel, of the most demonstrations, of every task's figure; none of tasks that learn from none."""
+    """The last panel, of most demonstrations or labels, of every task's figure; none of tasks that learn from none."""
     shown = {task: found[-1] for task, result in results.items() if (found := panels(result))}
     figure, places = panel_grid(max(1, len(shown)), 4.2, 3.2)
     for axes, (task, panel) in zip(places, shown.items(), strict=False):

@@ -10,6 +10,7 @@ from typing import Any
 from playslot_rl.acting.episodes import TaskPool
 from playslot_rl.config import CompareConfig, EnvConfig, ExperimentConfig, from_dict
 from playslot_rl.config.methods import METHODS, require_told
+from playslot_rl.config.plain import flatten
 from playslot_rl.envs import RECORDED, check_task
 from playslot_rl.errors import CheckpointError, ConfigError, OutputError
 from playslot_rl.evaluation.actions import error_text, require_offline
@@ -19,7 +20,7 @@ from playslot_rl.evaluation.success import DEFAULT_EPISODES, run_references
 from playslot_rl.methods.training import check_method
 from playslot_rl.runs import Run
 from playslot_rl.storage.atomic import json_or_nothing
-from playslot_rl.storage.checkpoints import require_config
+from playslot_rl.storage.checkpoints import StageCheckpoint, read_stage, require_config
 from playslot_rl.storage.resume import first_difference
 from playslot_rl.studies import launch
 from playslot_rl.studies.launch import Status, train
@@ -260,14 +261,18 @@ def check_success(config: ExperimentConfig) -> None:
 
 
 def require_same_trainings(config: ExperimentConfig) -> None:
-    """Refuse settings, or a world model, with which trainings of this folder were not begun, by a ConfigError: each job
-    would, one after the other, and what is there would be lost from the result.
+    """Refuse settings, or a world model, with which finished trainings of this folder were not made, by a ConfigError:
+    each job would, one after the other, and what is there would be lost from the result.
     """
     for job in success_jobs(config, Path(config.out)):
-        begun, folder = json_or_nothing(job.file).get("config"), job.run / job.stage
-        if not begun or not any((folder / name).is_dir() for name in ("checkpoint", "checkpoints")):
+        path = job.run / job.stage / "checkpoint"
+        if not (path / "meta.json").is_file():
             continue
-        found = _other_settings(config, job, begun) or _other_world(config, job)
+        try:
+            done = read_stage(path, job.stage)
+        except CheckpointError:  # damaged: the job says so
+            continue
+        found = _other_settings(config, job, done) or _other_world(config, job, done)
         if found is not None:
             key, known, got = found
             raise ConfigError(
@@ -276,24 +281,32 @@ def require_same_trainings(config: ExperimentConfig) -> None:
             )
 
 
-def _other_settings(config: ExperimentConfig, job: SuccessJob, begun: Any) -> tuple[str, Any, Any] | None:
-    """The first setting that is not as a job was begun with: its key, as it was and as it is."""
+def _other_settings(config: ExperimentConfig, job: SuccessJob, done: StageCheckpoint) -> tuple[str, Any, Any] | None:
+    """The first setting that is not as a job was trained with: its key, as it was and as it is. Of the sizes, which the
+    world model decides, those that its file, too, says were otherwise.
+    """
+    spec, own = METHODS[job.method].last, success_config(config, job, "")
+    wanted, stored = StageRecord(spec, job.run, own).finishes(), flatten(done.config)
+    sizes = flatten({"model": wanted.pop("model", {})})
+    found = first_difference({key: stored[key] for key in flatten(wanted) if key in stored}, wanted, spec.typed)
     try:
-        before = from_dict(ExperimentConfig, begun)
-    except ValueError:  # of an earlier version: the job itself says what is unlike
-        return None
-    if before.data.held_out != config.data.held_out:  # which data there are to learn from
-        return "data.held_out", before.data.held_out, config.data.held_out
-    spec = METHODS[job.method].last
-    old, own = (StageRecord(spec, job.run, one).finishes() for one in (before, success_config(config, job, "")))
-    return first_difference(old, own, spec.typed)
+        before = from_dict(ExperimentConfig, json_or_nothing(job.file)["config"])
+    except (KeyError, ValueError):  # none, or of an earlier version
+        return found
+    asked = flatten({"model": StageRecord(spec, job.run, before).finishes().get("model", {})})
+    for key, value in sizes.items():
+        if asked.get(key) != value and asked.get(key) == stored.get(key):
+            found = found or (key, stored[key], value)
+    kept = before.data.held_out, config.data.held_out
+    if config.data.demos and not job.online and kept[0] != kept[1]:  # what is recorded here says itself how many
+        found = found or ("data.held_out", *kept)
+    return found
 
 
-def _other_world(config: ExperimentConfig, job: SuccessJob) -> tuple[str, str, str] | None:
+def _other_world(config: ExperimentConfig, job: SuccessJob, done: StageCheckpoint) -> tuple[str, str, str] | None:
     """`run`, where a finished job built on another world model: that one, and the one of now."""
-    parents = json_or_nothing(job.run / job.stage / "checkpoint" / "meta.json").get("parents", {})
-    run = world_run(config, job.world)
-    for name in METHODS[job.method].world if parents else ():
+    run, parents = world_run(config, job.world), done.meta.get("parents", {})
+    for name in METHODS[job.method].world:
         try:
             own = Run.open(run).stage(name).fingerprint
         except CheckpointError:  # it is to be trained
