@@ -271,10 +271,11 @@ def test_a_robots_sets_that_are_taken_for_a_simulators_are_said(
         write_robot(tmp_path / "arm", robot="arm\nnote: none"),
         write_robot(tmp_path / "a", robot="button_press"),
     )
-    source = open_configured(compose(["preset=smoke", "env=video"]), [arm])
+    own = compose(["preset=smoke", "env=video"])
+    source = open_configured(own, [arm])
     capsys.readouterr()
     say_foreign(EnvConfig(name="video"), source, str(arm))
-    say_foreign(EnvConfig(), source, str(known))
+    say_foreign(EnvConfig(), open_configured(own, [known]), str(known))
     assert not capsys.readouterr().err
     say_foreign(EnvConfig(), source, f"{known}:2,{arm}:1")
     (line,) = capsys.readouterr().err.splitlines()
