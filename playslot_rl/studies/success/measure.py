@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -264,6 +266,7 @@ def require_same_trainings(config: ExperimentConfig) -> None:
     """Refuse settings, or a world model, with which finished trainings of this folder were not made, by a ConfigError:
     each job would, one after the other, and what is there would be lost from the result.
     """
+    prints = functools.cache(lambda run: _world_prints(run, world_parts(config.compare.methods)))
     for job in success_jobs(config, Path(config.out)):
         path = job.run / job.stage / "checkpoint"
         if not (path / "meta.json").is_file():
@@ -272,7 +275,8 @@ def require_same_trainings(config: ExperimentConfig) -> None:
             done = read_stage(path, job.stage)
         except CheckpointError:  # damaged: the job says so
             continue
-        found = _other_settings(config, job, done) or _other_world(config, job, done)
+        run = world_run(config, job.world)
+        found = _other_settings(config, job, done) or _other_world(job, run, prints(run), done)
         if found is not None:
             key, known, got = found
             raise ConfigError(
@@ -303,17 +307,24 @@ def _other_settings(config: ExperimentConfig, job: SuccessJob, done: StageCheckp
     return found
 
 
-def _other_world(config: ExperimentConfig, job: SuccessJob, done: StageCheckpoint) -> tuple[str, str, str] | None:
-    """`run`, where a finished job built on another world model: that one, and the one of now."""
-    run, parents = world_run(config, job.world), done.meta.get("parents", {})
+def _other_world(
+    job: SuccessJob, run: str, prints: Mapping[str, str], done: StageCheckpoint
+) -> tuple[str, str, str] | None:
+    """`run`, where a finished job built on another world model than the one of these fingerprints: that one, and it."""
+    parents = done.meta.get("parents", {})
     for name in METHODS[job.method].world:
-        try:
-            own = Run.open(run).stage(name).fingerprint
-        except CheckpointError:  # it is to be trained
-            own = "none yet"
-        if parents.get(name, own) != own:
-            return "run", f"a world model with {name} {parents[name]}", f"{run} with {own}"
+        if parents.get(name, prints[name]) != prints[name]:
+            return "run", f"a world model with {name} {parents[name]}", f"{run} with {prints[name]}"
     return None
+
+
+def _world_prints(run: str, stages: Sequence[str]) -> dict[str, str]:
+    """Fingerprints of a world model's stages; "none yet" where one is to be trained."""
+    found = dict.fromkeys(stages, "none yet")
+    for name in stages:
+        with suppress(CheckpointError):
+            found[name] = Run.open(run).stage(name).fingerprint
+    return found
 
 
 def check_recorded(config: ExperimentConfig) -> None:

@@ -174,11 +174,8 @@ def _table(rows: Sequence[Result], axis: str, texts: Sequence[str]) -> Table:
 def _apart(row: Result, result: Result) -> str:
     """`+35 (28 to 42)`, in points of success or in units of the error, bold where 0 is left out; and of how many seeds,
     if not all."""
-    own = (
-        f" (of {len(row['seeds'])} seed{'s' * (len(row['seeds']) > 1)})"
-        if len(row["seeds"]) < _seeds(row, result)
-        else ""
-    )
+    there = len(row["seeds"])
+    own = f" (of {there} seed{'s' * (there > 1)})" if there < _seeds(row, result) else ""
     if result.get("measure") != "actions":
         return points_text(row["difference"], row["ci95"]) + own
     return in_bold([f"{number:+.3g}" for number in (row["difference"], *row["ci95"])], row["leaves_out_0"]) + own

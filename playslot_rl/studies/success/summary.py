@@ -104,9 +104,10 @@ def differences(rows: Sequence[Row], reference: str) -> list[dict[str, Any]]:
         for cell, runs in known.items():
             if cell[:2] == other[:2] or not (at := _pair(cell, other)):
                 continue
-            seeds, tables = _met(runs, there, min(len(worlds[cell[0]]), len(worlds[reference])) > 1)
-            if not seeds:
+            met = _met(runs, there, min(len(worlds[cell[0]]), len(worlds[reference])) > 1)
+            if met is None:
                 continue
+            seeds, tables = met
             of_errors = "mae" in there[0]
             apart, actions = paired(*tables), there[0]["per_episode"]["rows"] if of_errors else 1.0
             low, high = hierarchical(apart, weights=actions) if of_errors else of_differences(*tables)
@@ -134,13 +135,14 @@ def _pair(cell: tuple[Any, ...], reference: tuple[Any, ...]) -> tuple[Any, Any] 
     return (cell if alone[1] else reference)[2], labels[0] if labels else None
 
 
-def _met(runs: Sequence[Row], reference: Sequence[Row], several: bool) -> tuple[list[int], tuple[Outcomes, Outcomes]]:
-    """The seeds that both sides have, and the outcomes of each, paired by world models where both have `several`."""
+def _met(
+    runs: Sequence[Row], reference: Sequence[Row], several: bool
+) -> tuple[list[int], tuple[Outcomes, Outcomes]] | None:
+    """The seeds that both sides have, and the outcomes of each, paired by world models where both have `several`; None
+    where they have no seed in common."""
     sides = _in_both(runs, reference, ("world", "seed") if several else ("seed",))
     seeds = sorted({run["seed"] for run in sides[0]})
-    if not seeds:
-        return [], (np.zeros((0, 0, 0)), np.zeros((0, 0, 0)))
-    return seeds, (outcomes_of(sides[0], seeds), outcomes_of(sides[1], seeds))
+    return (seeds, (outcomes_of(sides[0], seeds), outcomes_of(sides[1], seeds))) if seeds else None
 
 
 def _in_both(runs: Sequence[Row], reference: Sequence[Row], keys: Sequence[str]) -> tuple[list[Row], list[Row]]:
@@ -183,9 +185,9 @@ def apart_across_tasks(results: Sequence[Mapping[str, Any]], reference: str | No
             sides = []
             for task in tasks:
                 several = min(len({run["world"] for run in task[side]}) for side in (key, first)) > 1
-                sides.append(_met(task[key], task[first], several))
-            if all(seeds for seeds, _ in sides):
-                value, interval = apart_over_tasks([tables for _, tables in sides])
+                sides += [met[1]] if (met := _met(task[key], task[first], several)) else []
+            if len(sides) == len(tasks):
+                value, interval = apart_over_tasks(sides)
                 names = dict(zip(("method", "protocol", "labels"), key, strict=True))
                 found.append({**names, "title": tasks[0][key][0]["title"], "difference": value, "ci95": list(interval)})
     return found
